@@ -1,4 +1,4 @@
-// The chores of check-dialects.sh that want a program: Gaussians synthetic, files compared, images compared. Reads and
+// The chores of check-dialects.sh that need a program: Gaussians synthetic, files compared, images compared. Reads and
 // writes plain .ply files with a reader of its own, so that no error of ours can hide.
 import { readFileSync, writeFileSync } from 'node:fs';
 
@@ -7,8 +7,8 @@ const COUNT = 5000;
 /// SH basis function of degree 0, 1/(2√π).
 const SH_C0 = 0.28209479177387814;
 /// The largest difference two readers of one file may have: position (share of the scene), log scale, turn (radians),
-/// opacity, base colour, SH. Readers agree to rounding, except that 255 steps of a .splat's quaternion are read around 127.5
-/// or 128, and that opacities of 0 and 1 have no logit.
+/// opacity, base colour, SH. Readers agree to rounding, except that 255 steps of a .splat's quaternion are read around
+/// 127.5 or 128, and that opacities of 0 and 1 have no logit.
 const EXACT = { mean: 1e-5, scale: 1e-4, turn: 2e-3, opacity: 0.002, color: 1e-4, sh: 1e-4 };
 const TOLERANCES = { splat: { ...EXACT, turn: 0.02 } };
 

@@ -2,12 +2,12 @@
 # Checks our files against other people's programs: PlayCanvas' splat-transform and gsplat.js, installed from npm into a
 # temporary folder with the Node 22 that splat-transform 3 needs. Not a part of the tests, because it needs a network.
 #
-#   examples/check-dialects.sh                 made-up Gaussians
+#   examples/check-dialects.sh                 synthetic Gaussians
 #   examples/check-dialects.sh FILE...         these as well: anything that splat4d opens
 #   SPLAT4D=PROGRAM examples/check-dialects.sh without building
 #
 # For every format: what we write, both programs read, and must read alike; what they write likewise. The last column is
-# the difference of pictures against the original, in dB.
+# the difference of images against the original, in dB.
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 work="$(mktemp -d)"

@@ -52,7 +52,7 @@ def main():
         print("These cameras have no frames yet. Run:\n", *commands, "\nand then this script again.", sep="\n")
         sys.exit(1)
 
-    # Cameras that started or stopped late would leave instants that only some of them saw.
+    # Cameras that started or stopped late would leave times that only some of them recorded.
     count = min(len(camera["images"]) for camera in cameras)
     for camera in cameras:
         del camera["images"][count:]

@@ -30,7 +30,7 @@ for (const [name, size] of [['docs/gallery.html', { width: 1400, height: 900 }],
   });
 }
 
-test('the search finds a setting and leads to its row', { skip }, async () => {
+test('the search finds a setting and links to its row', { skip }, async () => {
   const { page, errors } = await open(browser, `${site.url}docs/recipe.html`, { viewport: { width: 1400, height: 900 } });
   await page.locator('.VPNavBarSearch button').first().click(PATIENCE);
   await page.fill('.search-input', 'max_cap', PATIENCE);

@@ -14,13 +14,13 @@ import numpy as np
 import splat4d
 
 WIDTH, HEIGHT, FPS = 400, 300, 15
-# The take is played so many times, this much slower than it happened, while the camera swings once.
+# The take is played this many times, slower by this factor, while the camera swings once.
 ROUNDS, SLOWER = 2, 2.5
 # Degrees to either side.
 SWING = 22
 # Degrees from top to bottom.
 FOV = 40
-# Pixels are drawn as the mean of so many across and down.
+# Each pixel is the mean of this many samples across and down.
 FINER = 2
 COLOURS = 256
 # Rounds of the search for these colours.

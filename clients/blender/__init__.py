@@ -26,7 +26,7 @@ ATTRIBUTES = {
     "section": ("INT", 1),  # of the page in the file; with `row` it names a Gaussian
     "row": ("INT", 1),
 }
-# Foreign properties of an object, by which the handler knows it.
+# Foreign properties of an object, by which the handler finds it.
 FILE, FIRST, LOOP = "s4d_file", "s4d_first_frame", "s4d_loop"
 TREE = "splat4d ellipsoids"
 # Ellipsoids end here: two standard deviations, where a Gaussian has 14 % of its opacity.

@@ -31,7 +31,7 @@ RAW, DEFLATE = 0, 1
 REQUIRED = 1
 NONE = 0xFFFFFFFF
 MOST_LOG = 40.0
-# Deflate shrinks at most so many times; a whole file, so many times and some bytes more.
+# Largest ratio of sizes of one deflate stream; of a whole file, with some bytes more for small ones.
 DEFLATE_MOST, FILE_MOST, FILE_SMALL = 1032, 64, 64 << 20
 VISIBLE = 1.0 / 255.0
 KNOWN = {b"PAGE", b"PALT", b"MASK", b"LABL", b"FEAT", b"POST", b"PROV"}

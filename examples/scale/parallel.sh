@@ -10,7 +10,7 @@ splat4d=${SPLAT4D:-splat4d}
 
 part() { "$splat4d" train "$capture" -o "$run" --chunk "$@"; }
 part shared "$@"
-# The plan says where the take is cut: one chunk more than there are cuts.
+# The plan states where the take is cut: one chunk more than there are cuts.
 chunks=$(python3 -c 'import json, sys; print(len(json.load(open(sys.argv[1]))["cuts"]) + 1)' "$run/chunks/plan.json")
 for first in 0 1; do # even chunks, then odd ones
     seq "$first" 2 $((chunks - 1)) |

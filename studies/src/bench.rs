@@ -87,7 +87,7 @@ pub(crate) struct Args {
     /// Folder for plots of the growth
     #[arg(long, value_name = "FOLDER", requires = "growth")]
     plots: Option<PathBuf>,
-    /// Measure how these runs, scenes or .s4d files play, in turns
+    /// Measure how these runs, scenes or .s4d files play, alternately
     #[arg(long, value_name = "FILE|RUN", num_args = 1.., conflicts_with_all = ["scenes", "growth", "simd", "rounds",
         "against"])]
     playback: Vec<PathBuf>,
@@ -149,7 +149,7 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     if !args.playback.is_empty() {
         return play(args, console);
     }
-    // What cannot work is said before anything takes time.
+    // Impossible settings are reported before any work.
     if (args.sweep || args.beside.is_some()) && args.device != Measured::Gpu {
         let error = Error::new(ErrorKind::BadInput, "--sweep and --beside need a GPU");
         return Err(error.remedy("Add --device gpu.").into());
@@ -241,7 +241,7 @@ fn play(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures what grows, on the most threads, and draws it.
+/// Measures growth with size, on the most threads, and plots it.
 fn grow(
     scenes: &[Pinned],
     args: &Args,

@@ -1,9 +1,9 @@
-//! What is done to a trained scene: a point of the study, and the points that it consists of.
+//! A cell of the study: operations on a trained scene, and the points that it consists of.
 
 use splat4d_train::compress::Compression;
 use splat4d_train::maintenance::importance::{Combine, Spatial, Temporal};
 
-/// Share of the Gaussians that goes where something else is varied, as 4DGS-1K on N3V.
+/// Share of pruned Gaussians where something else is varied, as 4DGS-1K on N3V.
 const AT: f64 = 0.8;
 /// Frames between key times where something else is varied, as there.
 const INTERVAL: usize = 20;
@@ -23,7 +23,7 @@ const OVERHEAD: f64 = 300.0;
 /// One treatment of the source.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Cell {
-    /// Share of the Gaussians that goes, in so many rounds.
+    /// Share of pruned Gaussians, in this many rounds.
     pub prune: f64,
     pub rounds: usize,
     pub score: Score,
@@ -51,7 +51,7 @@ impl Score {
     /// combine, and 4DGS-1K's own choice.
     pub(crate) fn all() -> Vec<(String, Self)> {
         let mut out = vec![("change, instant abs".to_owned(), DEFAULT)];
-        // Those of other systems' pruning can be asked for; here they would add a run each.
+        // Those of other systems' pruning can be requested; here they would add a run each.
         let spatial = [Spatial::Share, Spatial::Both].iter();
         out.extend(spatial.map(|s| (format!("{s}, instant abs"), Self { spatial: *s, ..DEFAULT })));
         let temporal = Temporal::ALL.iter().filter(|t| **t != DEFAULT.temporal);
@@ -71,7 +71,7 @@ impl Score {
 }
 
 impl Cell {
-    /// The source as it is.
+    /// The unchanged source.
     pub(crate) const fn source() -> Self {
         Self { prune: 0.0, rounds: 1, score: DEFAULT, steps: 0, interval: 0 }
     }
@@ -203,7 +203,7 @@ impl Grid {
         [0, self.steps].map(|steps| Cell { prune: AT, interval, steps, ..Cell::source() })
     }
 
-    /// Tuned, in so many rounds.
+    /// Tuned, in this many rounds.
     pub(crate) fn round(&self, rounds: usize) -> Cell {
         Cell { prune: AT, rounds, steps: self.steps, ..Cell::source() }
     }

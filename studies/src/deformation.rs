@@ -1,6 +1,7 @@
-//! E00: what a deformation network is. Fifty points move by sinusoids, straight lines and circles; a perceptron of 4,546
-//! numbers learns their displacement from noisy positions, against the best that standing still can do. A penalty on
-//! speed trades fidelity for smoothness; a sharp edge between two motions and a jump in time are what it cannot follow.
+//! E00: what a deformation network is. Fifty points move by sinusoids, straight lines and circles; a perceptron of
+//! 4,546 numbers learns their displacement from noisy positions, against the best that being at rest can do. A penalty
+//! on speed trades fidelity for smoothness; a sharp edge between two motions and a jump in time are what it cannot
+//! follow.
 
 use splat4d::math::Rng;
 use splat4d::nn::mlp::{InputGrad, Mlp, MlpShape, Passed};
@@ -58,7 +59,7 @@ pub(crate) enum Scene {
     Mixed,
     /// Points left of x = 0 are static, those right of it move up: the edge of an occluding object.
     Edge,
-    /// Every second point is somewhere else from t = ½ on: something appears, something goes.
+    /// Every second point is somewhere else from t = ½ on: one appears, one vanishes.
     Jump,
 }
 
@@ -79,7 +80,7 @@ pub(crate) struct Findings {
     pub mse: f64,
     /// The same at the edge or the jump and elsewhere, where the scene has one.
     pub parts: Option<[f64; 2]>,
-    /// Truth and network's positions of every point at every time, to draw.
+    /// Truth and network's positions of every point at every time, to plot.
     pub paths: [Vec<Path>; 2],
 }
 
@@ -135,7 +136,7 @@ pub(crate) fn run(scene: Scene, s: &Settings) -> Findings {
     }
 }
 
-/// Where points are at rest: evenly random in [−1, 1]².
+/// Rest positions of points: evenly random in [−1, 1]².
 fn start(s: &Settings, rng: Rng) -> Vec<[f64; 2]> {
     (0..s.points).map(|i| [0, 1].map(|k| 2.0 * rng.fork(1).uniform((2 * i + k) as u64) - 1.0)).collect()
 }

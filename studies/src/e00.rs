@@ -28,7 +28,7 @@ pub(crate) struct Args {
     /// Standard deviation of the noise on observed positions
     #[arg(long, value_name = "LENGTH", default_value_t = Settings::default().noise)]
     noise: f64,
-    /// So many runs with different seeds
+    /// This many runs with different seeds
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
 }
@@ -68,7 +68,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     files::write(&args.output.join("e00.json"), format!("{numbers:#}\n").as_bytes())?;
     let file = args.output.join("e00.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e00.json")}));
     Ok(())
@@ -140,7 +140,7 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Vec<Findings>)]) -> Vec<
         points: values.iter().enumerate().map(|(n, v)| (n as f64 / (s.frames - 1) as f64, *v)).collect(),
     };
     let by_time = [over_time("standing still", &first.distances[0]), over_time("network", &first.distances[1])];
-    // Zero has no logarithm: it stands a decade left of the smallest.
+    // Zero has no logarithm: it is a decade left of the smallest.
     let place = |l: f64| if l > 0.0 { l.log10() } else { LAMBDAS[1].log10() - 1.0 };
     let curve = |name: &str, of: &dyn Fn(&Findings) -> f64| Series {
         name: name.into(),

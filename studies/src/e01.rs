@@ -15,7 +15,8 @@ Examples:
 
 Tables are printed and written to DIR/e01.md, the drift to DIR/e01-drift.svg, all numbers to DIR/e01.json.";
 
-/// Speeds of the sphere (units a frame) and of the cube (degrees a frame) that are compared; the first is the main one.
+/// Speeds of the sphere (units per frame) and of the cube (degrees a frame) that are compared; the first is the main
+/// one.
 const MOTIONS: [(f64, f64); 4] = [(0.08, 4.0), (0.1, 5.0), (0.05, 4.0), (0.1, 3.0)];
 
 /// Follow lifted optical flow, and see how it drifts
@@ -48,7 +49,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     files::write(&args.output.join("e01.json"), format!("{numbers:#}\n").as_bytes())?;
     let file = args.output.join("e01.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e01.json")}));
     Ok(())
@@ -68,7 +69,7 @@ fn to_json(f: &Findings) -> Value {
 fn markdown(args: &Args, clean: &[Findings], noisy: &Findings) -> String {
     let last = args.frames - 1;
     let mut out = format!(
-        "# E01: scene flow lifted from optical flow\n\nA sphere moves along x, a cube turns about y, a wall stands still; \
+        "# E01: scene flow lifted from optical flow\n\nA sphere moves along x, a cube turns about y, a wall is static; \
          {} frames of exact flow. Lifted with the depth of one frame, motion along the viewing direction is missing; \
          positions are the sum of lifted flow. Errors are at frame {last}.\n\n\
          | sphere, units/frame | cube, °/frame | repeating frame 0, MSE | following flow, MSE | times better | \

@@ -47,7 +47,7 @@ Examples:
 Every variant is trained from the same recipe and measured on the held-out views: the filter on and off, predicting in
 Euclidean or in Wasserstein geometry, with and without log and exp, Kalman's own formulas, the linear and the W2 regulariser,
 and both. Flow is measured where the capture has truth/flow. What was found is in DIR/e02.json (after every run: the same
-command goes on where it was stopped), DIR/e02.md and DIR/e02.svg. With --json every run is a line.";
+command continues), DIR/e02.md and DIR/e02.svg. With --json every run is a line.";
 
 /// Measure the temporal filter and the transport regularisers
 #[derive(Debug, clap::Args)]
@@ -153,7 +153,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let wanted = |f: &FolderContent| orders.iter().any(|o| o.variant.key == f.key && o.print == f.print);
     study.cells.retain(wanted);
     (study.steps, study.seeds) = (orders[0].recipe.run.iterations, orders.len() / variants.len());
-    let stop = interrupt::flag("stopping: finished runs are kept, this one goes on next time");
+    let stop = interrupt::flag("stopping: finished runs are kept, this one continues next time");
     let missing: Vec<&Order> =
         orders.iter().filter(|o| !study.cells.iter().any(|f| f.print == o.print && f.key == o.variant.key)).collect();
     let started = Instant::now();
@@ -173,13 +173,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let Some(found) = judge(order, &capture, &truths, &folder, &stop, console)? else {
             return Err(Error::new(ErrorKind::Interrupted, "the study is unfinished; finished runs are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         };
         console.emit(&json!({"type": "cell", "cell": found}));
         study.cells.push(found);
         study.save(&file)?;
-        // A folder that stays costs room, not truth.
+        // A remaining folder costs only disk space.
         let _ = std::fs::remove_dir_all(&folder);
     }
     console.clear();
@@ -272,7 +272,7 @@ fn report_findings(study: &Study, variants: &[Variant], args: &Args, console: &C
     }
     let file = args.output.join("e02.md");
     files::write(&file, text.as_bytes())?;
-    console.say(text.trim_end());
+    console.print_line(text.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e02.json")}));
     Ok(())

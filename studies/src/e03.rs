@@ -45,7 +45,7 @@ Every cell prunes a share of the run's Gaussians and measures what is left \
 32-bit floats: shares from 0 to 95 %, the temporal \
                         filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
 rounds. What was found \
-                        is in DIR/e03.json (after every cell: the same command goes on where it was stopped), \
+                        is in DIR/e03.json (after every cell: the same command continues), \
                         DIR/e03.md and
 DIR/e03-*.svg. With --json every cell is a line.";
 
@@ -71,7 +71,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is said before anything takes time.
+    // Impossible settings are reported before any work.
     let trials = args.runs.iter().map(|path| Trial::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
     check_names(&trials)?;
     let file = args.output.join("e03.json");
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for trial in &trials {
         let grid = &trial.grid;
         let cells = grid.cells();
-        // A retrained run must not go on from what another scene has left.
+        // A retrained run must not continue from another scene's files.
         let work = args.output.join("work").join(format!("{}-{}", trial.name, trial.print));
         let others: Vec<_> = study.runs.iter().filter(|f| f.run != trial.path).cloned().collect();
         let progress = |cell: &Cell, Place { number, of, left }: Place| {
@@ -101,7 +101,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         if !all {
             return Err(Error::new(ErrorKind::Interrupted, "the study is unfinished; finished cells are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         }
         let _ = std::fs::remove_dir_all(&work);
@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     report_findings(&study, &trials, &args.output, console)
 }
 
-/// Tables and images of the runs that were asked for.
+/// Tables and images of the runs that were requested.
 fn report_findings(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
     let mut page = String::from("# Pruning and the temporal filter\n");
     for trial in trials {
@@ -127,7 +127,7 @@ fn report_findings(study: &Study, trials: &[Trial], folder: &Path, console: &Con
     }
     let file = folder.join("e03.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": folder.join("e03.json")}));
     Ok(())
@@ -202,7 +202,7 @@ impl Trial {
         let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
         let sides =
             in_turns(&subjects, &self.measured_views, &mut |done, total| console.phase("playing", done, total))?;
-        // A folder that stays costs room, not truth.
+        // A remaining folder costs only disk space.
         let _ = std::fs::remove_dir_all(&folder);
         let [source, side] = <[Side; 2]>::try_from(sides).expect("two subjects give two sides");
         let [speed, raster_speed] = [side.fps / source.fps, side.raster_fps / source.raster_fps];
@@ -237,7 +237,7 @@ fn plain(name: &str) -> String {
     name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect()
 }
 
-/// Refuses two runs whose results would go by one name.
+/// Refuses two runs whose results would have one name.
 fn check_names(trials: &[Trial]) -> Result<()> {
     let mut seen = BTreeSet::new();
     match trials.iter().find(|b| !seen.insert(b.name.as_str())) {

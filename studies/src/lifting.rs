@@ -1,6 +1,6 @@
 //! E01: scene flow lifted from optical flow. A sphere moves along x, a cube turns about y, a wall is static; exact flow
-//! of 20 frames is lifted with the depth of one frame and added up. It beats repeating frame 0 by far, and drifts: turning
-//! moves points along the viewing direction, which flow with one depth does not see.
+//! of 20 frames is lifted with the depth of one frame and added up. It beats repeating frame 0 by far, and drifts:
+//! turning moves points along the viewing direction, which flow with one depth does not see.
 
 use splat4d::flow::lift::{Integrator, drift, growth, integrate, lift, lift_in_plane};
 use splat4d::math::{Rng, Se3};
@@ -12,7 +12,7 @@ use splat4d::scene::camera::{Intrinsics, Lens};
 pub(crate) struct Settings {
     /// Frames.
     pub frames: usize,
-    /// The sphere's speed along x, units a frame.
+    /// The sphere's speed along x, units per frame.
     pub speed: f64,
     /// The cube's turn about y, degrees a frame.
     pub degrees: f64,
@@ -63,9 +63,9 @@ pub(crate) struct Findings {
     pub fitted_drift: Vec<f64>,
     /// Slope of log error over log frame: 1 is a bias, ½ a random walk.
     pub growth: Option<f64>,
-    /// Smoothing the lifted flow over time, so many passes: what it does at the first step and at the last.
+    /// Smoothing the lifted flow over time, this many passes: what it does at the first step and at the last.
     pub smoothing: Vec<Smoothed>,
-    /// Mean length of true and of lifted scene flow, units a frame.
+    /// Mean length of true and of lifted scene flow, units per frame.
     pub flow_lengths: [f64; 2],
 }
 
@@ -174,7 +174,7 @@ fn camera() -> Camera {
     Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }
 }
 
-/// Where every point is at every frame.
+/// Position of every point at every frame.
 fn truth(s: &Settings) -> Vec<Vec<[f64; 3]>> {
     let mut out = Vec::new();
     let frames = 0..s.frames;
@@ -229,7 +229,7 @@ fn steps(path: &[[f64; 3]]) -> Vec<[f64; 3]> {
     path.windows(2).map(|w| std::array::from_fn(|k| w[1][k] - w[0][k])).collect()
 }
 
-/// Mean of every three neighbours in time, of two at the ends; the sum over all steps stays what it was but for the ends.
+/// Mean of every three neighbours in time, of two at the ends; the sum over all steps is unchanged except for the ends.
 fn average(flow: &[[f64; 3]]) -> Vec<[f64; 3]> {
     let mean = |n: usize| {
         let near = &flow[n.saturating_sub(1)..(n + 2).min(flow.len())];
@@ -302,7 +302,7 @@ mod tests {
         let [none, once, twice] = [0, 1, 2].map(|i| f.smoothing[i]);
         assert!(once.step_rmse < none.step_rmse && twice.step_rmse < once.step_rmse, "{:?}", f.smoothing);
         assert!((twice.last_mse / none.last_mse - 1.0).abs() < 0.02, "integration telescopes: {:?}", f.smoothing);
-        // Noise alone is a random walk; looking at every frame has no walk at all.
+        // Noise alone is a random walk; using every frame has no random walk.
         assert!(f.both_depths_mse * 8.0 < f.lifted_mse);
         assert!(f.fitted_mse < f.both_depths_mse, "{} {}", f.fitted_mse, f.both_depths_mse);
         assert_eq!(run(&noisy), f, "the same seed, the same numbers");

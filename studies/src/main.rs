@@ -12,7 +12,7 @@
 //! | `made/` | synthetic captures, each hard for one reason |
 //! | `e00.rs`, `e01.rs`, `e02.rs`, `e03.rs`, `models.rs` | the studies; `e02/` is the ablation of the filter |
 //! | `suite/` | the recipe on a list of captures (docs/suite.md) |
-//! | `bench.rs`, `bench/` | pinned scenes, stages, training steps, growth, GPU stages, playback, other programs (`beside/with_gsplat.py`); each time with its lower bound (docs/benchmarks.md) |
+//! | `bench.rs`, `bench/` | pinned scenes, stages, training steps, growth, GPU stages, playback, other programs (`other_programs/with_gsplat.py`); each time with its lower bound (docs/benchmarks.md) |
 
 mod bench;
 mod cells;
@@ -44,7 +44,7 @@ Examples:
   studies bench                        speed of this machine, stage by stage
   studies make one-wall runs/one-wall  a synthetic capture that is hard for one reason
 
-A study can be stopped at any time and goes on where it was.";
+A study can be stopped at any time and continues where it was.";
 
 /// Studies of the methods: tables and curves of what they gain and lose
 #[derive(Debug, Parser)]
@@ -65,7 +65,7 @@ enum Study {
     Models(models::Args),
     Suite(suite::Args),
     Bench(Box<bench::Args>),
-    /// Draw a synthetic capture that is hard for one reason
+    /// Render a synthetic capture that is hard for one reason
     Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
     #[command(hide = true)]

@@ -36,7 +36,7 @@ Every cell is a run of its \
                         own (DIR/CAPTURE-MODEL), trained by `splat4d train` on images of half size, measured on \
                         the
 held-out views and played on the CPU at 800x800. A run that is there is not trained \
-                        again: the same command goes on where
+                        again: the same command continues where
 it was stopped. The table is printed and written to \
                         DIR/models.md, the numbers to DIR/models.json.";
 
@@ -59,7 +59,7 @@ pub(crate) struct Args {
     /// Reduce images by k
     #[arg(long, value_name = "K", default_value_t = 2)]
     downscale: usize,
-    /// Also replace what stands between `<!-- models -->` and `<!-- /models -->` in this page
+    /// Also replace what is between `<!-- models -->` and `<!-- /models -->` in this page
     #[arg(long, value_name = "FILE")]
     into: Option<PathBuf>,
     /// Set a setting of every cell's recipe; may be repeated
@@ -106,7 +106,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         if stop.load(Ordering::SeqCst) {
             return Err(Error::new(ErrorKind::Interrupted, "the comparison is unfinished; finished cells are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         }
         let cell = match refused {
@@ -126,7 +126,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(path, format!("{before}\n\n{}\n\n{after}", table.trim_end()).as_bytes())?;
         console.written(path);
     }
-    console.say(table.trim_end());
+    console.print_line(table.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("models.json")}));
     Ok(())
@@ -145,7 +145,7 @@ fn parted(page: &str) -> splat4d::Result<[&str; 2]> {
     })
 }
 
-/// The models that are asked for, in the library's order.
+/// The models that are requested, in the library's order.
 fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
     let all = MODELS.iter().copied();
     if let Some(unknown) = only.iter().find(|m| !all.clone().any(|a| a == m.as_str())) {
@@ -183,7 +183,7 @@ fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicB
         return Ok(None);
     }
     let text = std::fs::read_to_string(&log).unwrap_or_default();
-    let error = text.lines().find_map(|l| l.strip_prefix("error: ")).unwrap_or("it ended without a word");
+    let error = text.lines().find_map(|l| l.strip_prefix("error: ")).unwrap_or("it ended without a message");
     Ok(Some(error.to_owned()))
 }
 

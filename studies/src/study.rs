@@ -1,4 +1,4 @@
-//! What a study has found so far. It is written after every cell, so that nothing is measured twice.
+//! The present results of a study. It is written after every cell, so that nothing is measured twice.
 
 use crate::cells::Cell;
 use serde::{Deserialize, Serialize};
@@ -35,7 +35,7 @@ pub(crate) struct FolderContent {
     pub key: String,
     pub words: String,
     pub side: Side,
-    /// Frames a second end to end, over those of the source measured in turns with it.
+    /// Frames a second end to end, over those of the source measured alternately with it.
     pub speed: f64,
     /// The same of the blend stage alone.
     pub raster_speed: f64,
@@ -97,8 +97,8 @@ pub(crate) struct Judged {
     pub raster_speed: f64,
 }
 
-/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell,
-/// with the findings so far. Returns whether all are there now.
+/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` is called with every new
+/// cell, with the present results. Returns whether all are complete.
 pub(crate) fn fill(
     findings: &mut Findings,
     cells: &[Cell],
@@ -127,7 +127,7 @@ pub(crate) fn fill(
 pub(crate) struct Place {
     pub number: usize,
     pub of: usize,
-    /// Seconds, estimated from the cells so far; None before the first.
+    /// Seconds, estimated from the finished cells; None before the first.
     pub left: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! What a study found, as tables for Markdown pages and as curves.
+//! Results of a study, as tables for Markdown pages and as curves.
 
 use crate::cells::{Cell, Grid};
 use crate::study::{Findings, FolderContent};
@@ -15,7 +15,7 @@ pub(crate) fn markdown(findings: &Findings, grid: &Grid) -> String {
             out,
             "\n{} Gaussians, {} as 32-bit floats; fine-tuning takes {} steps. PSNR is that of the held-out views, \
              `moving` is that of dynamic regions. Frames a second are the CPU's, end to end (blending alone), times those of \
-             the source, which were measured in turns with them.\n",
+             the source, which were measured alternately with them.\n",
             grouped(source.side.gaussians),
             human_bytes(source.side.float_bytes),
             grouped(grid.steps)

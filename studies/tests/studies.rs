@@ -54,7 +54,7 @@ fn a_study_of_pruning_measures_every_cell_once() {
     assert!(!folder.join("work").exists(), "what cells were made from is gone");
     let psnr = |key: &str| cells[key]["side"]["psnr"].as_f64().unwrap();
     let gaussians = |key: &str| cells[key]["side"]["gaussians"].as_u64().unwrap();
-    // The source is measured as `train` did, and what is removed is counted.
+    // The source is measured as `train` did, and removed Gaussians are counted.
     let own = json_of(&run.join("results.json"))["ours_20"]["PSNR"].as_f64().unwrap();
     let source = "prune000-steps0-interval0";
     assert!((psnr(source) - own).abs() < 1e-9, "{} and {own}", psnr(source));
@@ -124,7 +124,7 @@ fn the_filter_is_studied_part_by_part() {
     assert!(page.contains("| the motion alone |") && page.contains("| filter and W2 regulariser |"), "{page}");
     assert!(folder.join("e02.svg").is_file());
 
-    // Nothing is measured twice; what is lost is measured again and is the same: seeds are fixed.
+    // Nothing is measured twice; lost cells are measured again with the same result: seeds are fixed.
     assert!(cells(&study().args(&["--json"]).run().ok()).is_empty());
     let file = folder.join("e02.json");
     let mut cut = json_of(&file);

@@ -15,7 +15,7 @@ pub(crate) struct Camera {
     pub focal: f64,
     /// Rows of the rotation: the camera's x, y, z axes in the world.
     pub axes: [V3; 3],
-    /// Where it stands.
+    /// Its position.
     pub position: V3,
 }
 

@@ -20,7 +20,7 @@ const HEIGHT: usize = 300;
 /// Pixels; gives 67° across.
 const FOCAL: f64 = 300.0;
 pub(crate) const CAMERAS: usize = 20;
-/// The cameras stand on an arc of this many degrees about the scene, alternately at two heights.
+/// The cameras are on an arc of this many degrees about the scene, alternately at two heights.
 const ARC_DEGREES: f64 = 170.0;
 const ARC_RADIUS: f64 = 5.8;
 const ARC_HEIGHTS: [f64; 2] = [1.7, 3.3];
@@ -30,7 +30,7 @@ pub(crate) const HELD_OUT: [usize; 4] = [3, 8, 11, 16];
 /// Quantisation step 13 at all frequencies: about 20 KB and 40 dB per image, so that 600 of them stay below 13 MB.
 /// (Lossless PNG takes 68 KB each.)
 const JPEG_QUALITY: u8 = 60;
-/// Views that come with depth and flow.
+/// Views with depth and flow.
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 
@@ -61,7 +61,7 @@ struct View {
     tracks_seen: Vec<u8>,
 }
 
-/// Draws the capture; `maps`: with depth, flow and labels of every image.
+/// Renders the capture; `maps`: with depth, flow and labels of every image.
 pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     let start = std::time::Instant::now();
     let stage = Stage::load(&home.join("characters"))?;
@@ -106,7 +106,7 @@ pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     Ok(())
 }
 
-/// Draws the given (camera, frame) pairs again and compares them with the files in `folder`.
+/// Renders the given (camera, frame) pairs again and compares them with the files in `folder`.
 pub(crate) fn check(folder: &Path, picks: &[(usize, usize)]) -> Result<()> {
     let stage = Stage::load(&folder.join("characters"))?;
     let cameras = rig();

@@ -34,7 +34,7 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         [] => capture::write(&home, &home, false),
         [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),
         _ => bail!(
-            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is wanted, and a folder, or --long with seconds and a folder"
+            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is needed, and a folder, or --long with seconds and a folder"
         ),
     }
 }

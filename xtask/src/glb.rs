@@ -41,7 +41,7 @@ impl Glb {
         Ok(Glb { json: json.context("GLB without a JSON chunk")?, bin })
     }
 
-    /// The file's bytes; both chunks padded to four bytes as the format asks.
+    /// The file's bytes; both chunks padded to four bytes as the format requires.
     pub(crate) fn to_bytes(&self) -> Vec<u8> {
         let mut json = self.json.to_string().into_bytes();
         json.resize(json.len().next_multiple_of(4), b' ');

@@ -34,7 +34,7 @@ pub(crate) struct Light {
 }
 
 impl Light {
-    /// Draws the shadow map of `casters`; `glow` is the orb's centre while it exists.
+    /// Renders the shadow map of `casters`; `glow` is the orb's centre while it exists.
     pub(crate) fn new(casters: &Mesh, glow: Option<V3>) -> Light {
         let key = KEY_DIRECTION.unit();
         let right = v3(0.0, 1.0, 0.0).cross(key).unit();

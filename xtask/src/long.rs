@@ -1,5 +1,5 @@
-//! `capture --long SECONDS FOLDER`: the hall with both characters for as long as one likes, filmed by twenty cameras. Every
-//! part goes round at a pace of its own, so that no two times are alike; one frame is in memory at a time.
+//! `capture --long SECONDS FOLDER`: the hall with both characters for as long as one likes, filmed by twenty cameras.
+//! Every part circulates at a pace of its own, so that no two times are alike; one frame is in memory at a time.
 
 use crate::camera::Camera;
 use crate::capture::{CAMERAS, HELD_OUT, bundled_folder, jpeg, rig_of};
@@ -23,8 +23,8 @@ const HEIGHT: usize = 150;
 const FOCAL: f64 = 150.0;
 /// Most seconds: file names have six digits.
 const MAX_SECONDS: f64 = 999_999.0 / FPS;
-/// Seconds of one round of: the knight's way across and along, his blows, the mage's way across and along, the ball's circle
-/// and its bounces. No two are in a simple ratio.
+/// Seconds of one round of: the knight's way across and along, his blows, the mage's way across and along, the ball's
+/// circle and its bounces. No two are in a simple ratio.
 const ROUNDS: [f64; 7] = [5.3, 4.1, 3.7, 6.7, 8.9, 3.1, 0.62];
 const BALL_RADIUS: f64 = 0.34;
 /// Height of a bounce, scene units.
@@ -73,12 +73,12 @@ pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
     write_file(&folder.join("capture.json"), (serde_json::to_string_pretty(&capture)? + "\n").as_bytes())
 }
 
-/// Sine and cosine of the way round number `k`.
+/// Sine and cosine of the angle of round `k`.
 fn round(k: usize, seconds: f64) -> (f64, f64) {
     sin_cos(2.0 * std::f64::consts::PI * phase(k, seconds))
 }
 
-/// Share of the way round number `k` that is behind, 0 to 1.
+/// Finished share of round `k`, 0 to 1.
 fn phase(k: usize, seconds: f64) -> f64 {
     let rounds = seconds / ROUNDS[k];
     rounds - rounds.floor()

@@ -78,7 +78,7 @@ chores:
                          \
                          disturbs every verb that writes (kill -9, full disk, two owners, clock jumps, read-only
      \
-                                             folders) and compares its result with the undisturbed one; wants the \
+                                             folders) and compares its result with the undisturbed one; needs the \
                      release build
   count [FOLDER]             counts lines of code, without tests, comments and \
                      blank lines, of the repository FOLDER";

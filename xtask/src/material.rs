@@ -49,7 +49,7 @@ pub(crate) fn albedo(material: u16, uv: [f64; 2], textures: [&Texture; 2]) -> V3
     }
 }
 
-/// Light that a material gives off by itself.
+/// Emitted light of a material.
 pub(crate) fn glow(material: u16) -> V3 {
     if material == ORB { srgb(70, 190, 200) } else { V3::default() }
 }

@@ -48,7 +48,7 @@ pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, s
     out
 }
 
-/// Shades every sample, filters the samples to pixels and hands out each pixel's linear colour (nothing is black) and the
+/// Shades every sample, filters the samples to pixels and returns each pixel's linear colour (nothing is black) and the
 /// share that moving objects cover, rows from the top.
 fn each_pixel(
     textures: [&Texture; 2],
@@ -129,8 +129,8 @@ impl SampleShader<'_> {
     }
 }
 
-/// How much of the sky a point sees: darker in the hall's corners, under things that stand on the floor, and on the
-/// lower side of things.
+/// How much of the sky a point sees: darker in the hall's corners, under objects on the floor, and on the lower side of
+/// objects.
 fn openness(frame: &Frame, point: V3, normal: V3, object: u8) -> f64 {
     let wall = (SIDE - point.x.abs()).min(point.z - BACK).min(FRONT - point.z);
     let edge = if point.y < 0.01 { wall } else { point.y };
@@ -167,7 +167,7 @@ impl EdgeCache {
     }
 }
 
-/// World position of what the middle sample of pixel (x, y) sees, with its triangle, weights and depth.
+/// World position seen by the middle sample of pixel (x, y), with its triangle, weights and depth.
 pub(crate) fn surface(
     frame: &Frame,
     camera: &Camera,

@@ -11,7 +11,7 @@ use crate::vector::V3;
 
 /// Samples per pixel in each direction. Odd, so that the middle sample is the pixel's centre.
 pub(crate) const SUPERSAMPLING: usize = 3;
-/// Nothing nearer than this is drawn (scene units).
+/// Nothing nearer than this is rendered (scene units).
 const NEAR: f64 = 0.05;
 /// Marks a sample that sees nothing.
 pub(crate) const NOTHING: u32 = u32::MAX;
@@ -73,7 +73,7 @@ pub(crate) fn corners(mesh: &Mesh, camera: &Camera, index: usize) -> [V3; 3] {
     mesh.triangles[index].vertices.map(|v| camera.to_camera_axes(mesh.positions[v as usize]))
 }
 
-/// Draws the whole mesh.
+/// Renders the whole mesh.
 pub(crate) fn rasterize(mesh: &Mesh, camera: &Camera) -> Visibility {
     let (width, height) = (camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING);
     let mut out = Visibility {

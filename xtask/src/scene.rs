@@ -1,6 +1,6 @@
-//! What happens: the hall, its props, and thirty frames of a knight who storms at a mage's orb.
+//! The scene: the hall, its props, and thirty frames of a knight who storms at a mage's orb.
 //!
-//! Scene units are about 0.7 m: the knight stands 2.4 units tall. World +y is up.
+//! Scene units are about 0.7 m: the knight is 2.4 units tall. World +y is up.
 
 use crate::glb::Glb;
 use crate::light::Light;
@@ -19,7 +19,7 @@ pub(crate) const FRAMES: usize = 30;
 pub(crate) const FPS: f64 = 30.0;
 /// First frame in which the orb exists.
 pub(crate) const ORB_APPEARS: usize = 9;
-/// First frame in which the painted crate is gone.
+/// First frame without the painted crate.
 pub(crate) const CRATE_LEAVES: usize = 18;
 /// Number of objects, the static set (0) included: knight 1, mage 2, ball 3, crate 4, orb 5.
 pub(crate) const OBJECTS: usize = 6;
@@ -33,7 +33,7 @@ pub(crate) const SIDE: f64 = 7.5;
 const HEIGHT: f64 = 7.2;
 
 const ORB_RADIUS: f64 = 0.32;
-/// Where the blow's clip is entered, seconds, and how fast it runs: at full speed the sword moves 80 px per frame.
+/// Start of the blow's clip, seconds, and its speed: at full speed the sword moves 80 px per frame.
 const BLOW_START: f64 = 0.30;
 const BLOW_RATE: f64 = 0.53;
 const BALL_RADIUS: f64 = 0.34;
@@ -58,7 +58,7 @@ pub(crate) struct Frame {
     pub skinned: [Range<usize>; 2],
     /// The light with its shadow map.
     pub light: Light,
-    /// Where each moving thing stands on the floor, for contact shade.
+    /// Floor position of each moving object, for contact shade.
     pub feet: Vec<V3>,
 }
 
@@ -81,7 +81,7 @@ impl Stage {
         [&self.knight.texture, &self.mage.texture]
     }
 
-    /// The hall with something else that moves; `feet`: where it stands on the floor.
+    /// The hall with something else that moves; `feet`: where it is on the floor.
     pub(crate) fn with(&self, moving: &Mesh, feet: Vec<V3>) -> Frame {
         let mut casters = self.props.clone();
         casters.append(moving);

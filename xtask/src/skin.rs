@@ -65,7 +65,7 @@ pub(crate) struct Character {
 }
 
 impl Character {
-    /// Loads the first skin, all meshes and all clips. Errors: features this small reader does not know.
+    /// Loads the first skin, all meshes and all clips. Errors: features this small reader does not support.
     pub(crate) fn load(glb: &Glb) -> Result<Character> {
         let nodes = glb.list("nodes");
         let mut parents = vec![None; nodes.len()];

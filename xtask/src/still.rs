@@ -19,7 +19,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Focal length in image widths: 39.6° across, as the NeRF-synthetic scenes have it (camera_angle_x = 0.691).
+/// Focal length in image widths: 39.6° across, as in the NeRF-synthetic scenes (camera_angle_x = 0.691).
 const FOCAL: f64 = 1.3889;
 /// The character's bounding sphere fills this share of the image's height.
 const FILL: f64 = 0.95;
@@ -36,7 +36,7 @@ const SIZES: std::ops::RangeInclusive<usize> = 16..=4096;
 /// See [`SIZES`].
 const VIEWS: std::ops::RangeInclusive<usize> = 2..=10_000;
 
-/// Settings of the capture that is drawn.
+/// Settings of the capture that is rendered.
 #[derive(Debug, PartialEq)]
 struct Wish {
     character: PathBuf,

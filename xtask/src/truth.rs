@@ -102,7 +102,7 @@ pub(crate) fn tracked_vertices(frame: &Frame, views: &[(&Camera, &Visibility)]) 
     let mut out = Vec::with_capacity(TRACKS);
     for range in &frame.skinned {
         let candidates: Vec<usize> = range.clone().filter(seen).collect();
-        assert!(candidates.len() >= half, "a character shows {} vertices, {half} are wanted", candidates.len());
+        assert!(candidates.len() >= half, "a character shows {} vertices, {half} are needed", candidates.len());
         out.extend((0..half).map(|i| candidates[i * candidates.len() / half]));
     }
     out
@@ -129,8 +129,8 @@ fn is_seen(camera: &Camera, seen: &Visibility, point: V3) -> bool {
 /// A point of the sparse cloud: position and sRGB colour.
 pub(crate) type CloudPoint = ([f32; 3], [u8; 3]);
 
-/// Stands in for structure from motion: random pixels of the first frame, kept when enough cameras see the point,
-/// with noise. `views` are the training cameras with what they see and their images.
+/// Replaces structure from motion: random pixels of the first frame, kept when enough cameras see the point, with
+/// noise. `views` are the training cameras with what they see and their images.
 pub(crate) fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> Vec<CloudPoint> {
     let mut cloud = Vec::with_capacity(CLOUD_POINTS);
     let mut caches: Vec<EdgeCache> = views.iter().map(|_| EdgeCache::default()).collect();

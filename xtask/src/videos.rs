@@ -1,5 +1,5 @@
-//! `capture --videos FOLDER`: the bundled scene as eight people would film it: no common clock, no calibration, each with an
-//! exposure of its own, and with sound. Motion JPEG in AVI with 16-bit PCM, which needs no encoder.
+//! `capture --videos FOLDER`: the bundled scene as eight people would film it: no common clock, no calibration, each
+//! with an exposure of its own, and with sound. Motion JPEG in AVI with 16-bit PCM, which needs no encoder.
 
 use crate::camera::Camera;
 use crate::files::write_file;
@@ -18,7 +18,7 @@ const HEIGHT: usize = 360;
 const FOCAL: [f64; 8] = [372.0, 360.0, 366.0, 380.0, 355.0, 368.0, 374.0, 362.0];
 const RADIUS: [f64; 8] = [5.7, 5.9, 5.5, 6.0, 5.8, 5.6, 6.1, 5.7];
 const HEIGHTS: [f64; 8] = [1.6, 2.3, 1.9, 2.6, 1.7, 2.4, 1.8, 2.2];
-/// Degrees of the arc on which they stand.
+/// Degrees of the arc of the cameras.
 const ARC: f64 = 98.0;
 const TARGET: V3 = v3(0.0, 0.95, 0.1);
 /// Seconds after the first camera's beginning at which each one's video begins: whole frames and parts of them.
@@ -34,7 +34,7 @@ const JPEG_QUALITY: u8 = 78;
 
 /// Samples of sound a second.
 const RATE: u32 = 48_000;
-/// Metres of a scene unit, and what sound goes in a second.
+/// Metres of a scene unit, and the speed of sound.
 const METRES: f64 = 0.7;
 const SOUND: f64 = 343.0;
 /// A clap, steps, bounces, the blow: seconds of the film, place, loudness, seconds until it is faint.
@@ -57,7 +57,7 @@ const SOUNDS: [(f64, V3, f64, f64); 14] = [
 /// Loudness of each microphone's own noise.
 const NOISE: f64 = 0.004;
 
-/// Draws the videos and `truth.json`.
+/// Renders the videos and `truth.json`.
 pub(crate) fn command(folder: &Path) -> Result<()> {
     let stage = Stage::load(&crate::capture::bundled_folder().join("characters"))?;
     let cameras = rig();
@@ -116,7 +116,7 @@ fn noise(stream: u64, k: u64) -> f64 {
     ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
 }
 
-/// What a camera hears: every sound after its way through the air, fainter with it.
+/// A camera's sound: every sound after its travel time, fainter with distance.
 fn sound(camera: usize, view: &Camera) -> Vec<i16> {
     let length = (TAKEN as f64 / FPS * f64::from(RATE)) as usize;
     let mut out: Vec<f64> = (0..length as u64).map(|k| NOISE * noise(1000 + camera as u64, k)).collect();
@@ -174,7 +174,7 @@ fn avi(pictures: &[Vec<u8>], sound: &[i16]) -> Vec<u8> {
         out.extend((height as u16).to_le_bytes());
         chunk(b"strh", &out)
     };
-    // Flags, priority, initial frames, scale, rate, start, length, buffer, quality, bytes a sample.
+    // Flags, priority, initial frames, scale, rate, start, length, buffer, quality, bytes per sample.
     let film = header(b"vids", b"MJPG", [0, 0, 0, 1, rate, 0, count, largest, u32::MAX, 0]);
     let mut bitmap = words(&[40, width, height]);
     bitmap.extend([1, 0, 24, 0]);

@@ -1,5 +1,5 @@
-//! `capture --world NAME [--truth] FOLDER`: a world whose physics is known, filmed by eight cameras, with the true paths of its
-//! nodes, what was done to it, and masks that say which body a pixel shows.
+//! `capture --world NAME [--truth] FOLDER`: a world whose physics is known, filmed by eight cameras, with the true
+//! paths of its nodes, what was done to it, and masks of the body at each pixel.
 
 use crate::camera::Camera;
 use crate::files::{png, write_file};
@@ -21,7 +21,7 @@ const WIDTH: usize = 200;
 const HEIGHT: usize = 150;
 /// Pixels; gives 58° across.
 const FOCAL: f64 = 180.0;
-/// Cameras stand on an arc of so many degrees, alternately at two heights; one in the middle is held out.
+/// Cameras are on an arc of this many degrees, alternately at two heights; one in the middle is held out.
 const CAMERAS: usize = 8;
 const HELD_OUT: usize = 3;
 const ARC_DEGREES: f64 = 150.0;

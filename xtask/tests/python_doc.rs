@@ -57,7 +57,7 @@ fn comments(code: &str, words: &mut BTreeMap<String, String>) {
         };
         let mut name = None;
         if attribute {
-            // Its arguments look like fields.
+            // Its arguments resemble fields.
         } else if let Some(of) = named("struct ").filter(|_| outside) {
             name = Some(of.clone());
             owner = of;
@@ -74,7 +74,7 @@ fn comments(code: &str, words: &mut BTreeMap<String, String>) {
         {
             words.entry(name).or_insert_with(|| comment.trim().to_owned());
         }
-        // Attributes, which may have several lines, stand between a comment and its item.
+        // Attributes, which may have several lines, are between a comment and its item.
         attribute |= bare.starts_with("#[");
         if !attribute {
             comment.clear();
@@ -221,7 +221,8 @@ fn broken(shown: &str) -> String {
     format!("{}(\n    {}\n{}", &shown[..open], inside.trim_end_matches(", "), &shown[close..])
 }
 
-/// The page of scenes and captures, which follow each other in the stub, and the first of them and the first after them.
+/// The page of scenes and captures, which follow each other in the stub, and the first of them and the first after
+/// them.
 const SCENES: (&str, &str, &str) = ("docs/python-api-scenes.md", "\n## Gaussians\n", "\n## View\n");
 
 /// The class that is written in Python: its words and how it is made.

@@ -1,5 +1,5 @@
-//! Tidy: what the compiler does not check. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that the
-//! documents are right about paths and flags. Reads files only: no network, a second or two.
+//! Tidy: checks that the compiler does not make. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that
+//! the documents are right about paths and flags. Reads files only: no network, a second or two.
 
 #[path = "tidy/imports.rs"]
 mod imports;
@@ -17,19 +17,20 @@ mod words;
 const LONG_FILES: [(&str, &str); 0] = [];
 const MAX_LINES: usize = 800;
 
-/// Files that may say `unsafe`, in order, and why. ARCHITECTURE.md states the same sentence.
+/// Files that may use `unsafe`, in order, and why. ARCHITECTURE.md contains the same sentence.
 const UNSAFE_FILES: [(&str, &str); 3] = [
     ("crates/splat4d/src/nn/matmul.rs", "matrix products take pointers"),
     ("crates/splat4d/src/simd.rs", "dispatch to SIMD instructions"),
     ("crates/splat4d-train/tests/steady_step.rs", "a test that counts allocations"),
 ];
 
-/// Words that only the shells (the command and the chores) may say: libraries neither print nor exit nor look around.
+/// Words that only the shells (the command and the chores) may use: libraries neither print nor exit nor read the
+/// environment.
 const SHELL_WORDS: [&str; 9] =
     ["println!", "eprintln!", "print!", "eprint!", "dbg!", "process::exit", "env::args", "env::var", "stdin()"];
 const SHELLS: [&str; 4] = ["crates/splat4d-cli/", "crates/splat4d-fuzz/", "studies/", "xtask/"];
 
-/// Words that `splat4d` may not say: it reads bytes, not paths.
+/// Words that `splat4d` may not use: it reads bytes, not paths.
 const PATH_WORDS: [&str; 3] = ["std::fs", "std::path", "File::open"];
 
 /// Documents of the root whose paths, flags and words are checked, with all pages of docs/.
@@ -144,7 +145,7 @@ fn files_are_short() {
 #[test]
 fn unsafe_stays_where_it_is() {
     let says = |path: &str| {
-        // A hyphen belongs to the word: `unsafe-inline` is what web servers say about styles.
+        // A hyphen belongs to the word: `unsafe-inline` is what web servers show about styles.
         let word = |l: &str| l.split(|c| !is_word(c) && c != '-').any(|w| w == "unsafe");
         code(&read(path)).iter().any(|(_, l)| word(l))
     };
@@ -184,7 +185,7 @@ fn documents() -> Vec<String> {
     ROOT_DOCS.map(str::to_owned).into_iter().chain(files("docs", "md")).collect()
 }
 
-/// What a heading is linked by, as GitHub and the site (`site/.vitepress/markdown.mjs`) have it.
+/// The anchor of a heading on GitHub and the site (`site/.vitepress/markdown.mjs`).
 fn slug(heading: &str) -> String {
     let words = heading.trim_start_matches('#').trim().to_lowercase();
     words.chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c)).collect::<String>().replace(' ', "-")
@@ -256,7 +257,7 @@ fn paths_in_documents_exist() {
 }
 
 #[test]
-fn tests_that_hold_promises_exist() {
+fn tests_of_promises_exist() {
     let all: String = sources().iter().map(|path| read(path)).collect();
     let (mut troubles, mut names) = (Vec::new(), 0);
     let promises = read("SECURITY.md");
@@ -328,7 +329,7 @@ fn declared_flags() -> BTreeSet<String> {
     flags
 }
 
-/// Words of a text that look like long flags.
+/// Words of a text that are probably long flags.
 fn flags_in(text: &str) -> BTreeSet<String> {
     let mut out = BTreeSet::new();
     for (at, _) in text.match_indices("--") {
@@ -390,8 +391,8 @@ fn asks_which_model(line: &str, variant: &str, name: &str) -> bool {
     compared || behind || told
 }
 
-/// A new motion model is its own files and its entries: no other code may ask which one it is. Capabilities answer what
-/// others need to know.
+/// A new motion model is its own files and its entries: no other code may depend on which one it is. Capabilities state
+/// what others need.
 #[test]
 fn motion_models_are_named_only_in_their_modules() {
     let models = models();
@@ -425,8 +426,8 @@ const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 const DIALECT_NAMES: [(&str, &str); 1] =
     [("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder")];
 
-/// A new dialect is its own file and its entry in the list: no other code may name one. Its properties answer what others
-/// need to know.
+/// A new dialect is its own file and its entry in the list: no other code may name one. Its properties state what
+/// others need.
 #[test]
 fn dialects_are_named_only_in_their_modules() {
     let list = read(DIALECT_LIST);

@@ -1,5 +1,5 @@
-//! What the user sees while work goes on: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines.
-//! Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
+//! Output during work: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines. Results go to
+//! stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
 
 use crate::interrupt;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -17,7 +17,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-/// How much is said.
+/// How much is reported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Loudness {
     /// Warnings and errors only.
@@ -34,7 +34,7 @@ const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 const JSON_INTERVAL: Duration = Duration::from_secs(1);
 /// A shorter phase shows no time left.
 const LEAST_PACE: Duration = Duration::from_secs(3);
-/// Redraws of a bar a second: often enough to look alive, cheap over slow remote shells.
+/// Redraws of a bar a second: frequent enough for a terminal, cheap over slow remote shells.
 const BAR_RATE: u8 = 8;
 
 /// The one place that prints.
@@ -62,7 +62,7 @@ struct State {
     last_line: Option<Instant>,
     /// The first iteration after a pause gets a plain line of its own.
     said_progress: bool,
-    /// What `--json` would print, for a program that wants the objects themselves; none: it is printed.
+    /// Objects that `--json` would print, for a program that needs them; none: they are printed.
     objects: Option<Vec<Value>>,
 }
 
@@ -72,7 +72,7 @@ impl Listener for Console {
         match *event {
             Event::Phase { name, done, total } => self.phase(name, done, total),
             Event::PhaseEnded => self.clear(),
-            Event::Result(text) => self.say(text),
+            Event::Result(text) => self.print_line(text),
             Event::Record(value) => self.emit(value),
             Event::Detail(text) => self.detail(text),
             Event::Warning(text) => self.warn(text),
@@ -114,7 +114,7 @@ impl Console {
     }
 
     /// A result, on stdout; not with `--json`, not when quiet.
-    pub fn say(&self, text: &str) {
+    pub fn print_line(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
             self.above_bar(|| print(&stamped(&flags(text))));
         }
@@ -127,13 +127,13 @@ impl Console {
         }
     }
 
-    /// Prints the result that the verb was asked for: on stdout whatever the loudness.
+    /// Prints the verb's result on stdout at every level of output.
     pub fn result(&self, text: &str) {
         self.above_bar(|| print(text));
     }
 
-    /// The same of a report on something's health: its lines of trouble (`! …`) and its last line, the verdict, have
-    /// colours on a terminal.
+    /// The same for a health report: its lines of problems (`! …`) and its last line, the verdict, have colours on a
+    /// terminal.
     pub(crate) fn report(&self, text: &str, healthy: bool) {
         let text = text::shown(text);
         let colours = std::io::stdout().is_terminal()
@@ -159,13 +159,13 @@ impl Console {
 
     /// A file was written.
     pub fn written(&self, path: &Path) {
-        self.say(&format!("wrote {}", path.display()));
+        self.print_line(&format!("wrote {}", path.display()));
         self.emit(&json!({"type": "written", "path": path.to_string_lossy()}));
     }
 
     /// The next command to type, as the last line of a verb.
     pub(crate) fn next(&self, verb: &str, path: &Path) {
-        self.say(&format!("next: splat4d {verb} {}", in_command(path)));
+        self.print_line(&format!("next: splat4d {verb} {}", in_command(path)));
     }
 
     /// A warning: always printed.
@@ -216,7 +216,7 @@ impl Console {
                 self.clear();
                 let from =
                     if *iteration > 0 { format!("from step {} on, ", grouped(*iteration)) } else { String::new() };
-                self.say(&format!(
+                self.print_line(&format!(
                     "training {from}{} steps, {} Gaussians at the start, about {} of memory, into {}",
                     grouped(*iterations),
                     grouped(*gaussians),
@@ -226,7 +226,7 @@ impl Console {
             }
             Event::Predicted { iterations, gaussians, size: [width, height], seconds, memory_estimate } => {
                 self.clear();
-                self.say(&format!(
+                self.print_line(&format!(
                     "{} steps on images of {width}x{height}, at most {} Gaussians: about {} minutes in total and {} \
                      of memory",
                     grouped(*iterations),
@@ -259,15 +259,15 @@ impl Console {
             }
             Event::Device { why, .. } => {
                 self.clear();
-                self.say(why);
+                self.print_line(why);
             }
             Event::Chosen { motion, why } => {
                 self.clear();
-                self.say(&format!("motion model: {motion}, because {why}"));
+                self.print_line(&format!("motion model: {motion}, because {why}"));
             }
             Event::Counted { gaussians, why } => {
                 self.clear();
-                self.say(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
+                self.print_line(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
             }
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
@@ -279,13 +279,13 @@ impl Console {
                     0 => String::new(),
                     m => format!(", {} of memory at most", human_bytes(*m)),
                 };
-                self.say(&format!(
+                self.print_line(&format!(
                     "trained {} steps in {}: {} Gaussians{memory}",
                     grouped(*iteration),
                     human_seconds(*seconds),
                     grouped(*gaussians)
                 ));
-                advice.iter().for_each(|advice| self.say(advice));
+                advice.iter().for_each(|advice| self.print_line(advice));
             }
             _ => {}
         }
@@ -307,7 +307,7 @@ impl Console {
         });
     }
 
-    /// Whether an object is printed: at the start and the end of a phase, and once a second between them.
+    /// Whether an object is printed: at the start and the end of a phase, and once per second between them.
     fn is_due(&self, name: &str, done: usize, total: usize) -> bool {
         let mut state = self.state.borrow_mut();
         let ends = total > 0 && done >= total;
@@ -319,7 +319,7 @@ impl Console {
         due
     }
 
-    /// Seconds that are left of a phase, by its pace so far; none: too early to say.
+    /// Seconds that are left of a phase, by its average pace; none: too early to estimate.
     fn left(&self, name: &str, done: usize, total: usize) -> Option<f64> {
         let mut state = self.state.borrow_mut();
         let fresh = state.pace.as_ref().is_none_or(|p| p.name != name || done < p.first);
@@ -390,7 +390,8 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
-/// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
+/// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are
+/// escaped.
 fn one_json_line(value: &Value) -> String {
     let line = value.to_string();
     if !line.contains(text::acts) {
@@ -399,7 +400,7 @@ fn one_json_line(value: &Value) -> String {
     line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
 }
 
-/// A report in colours of ECMA-48: lines of trouble yellow, the verdict green or red.
+/// A report in colours of ECMA-48: lines of problems yellow, the verdict green or red.
 fn painted(report: &str, healthy: bool) -> String {
     let paint = |line: &str, colour: u8| format!("\x1b[{colour}m{line}\x1b[0m");
     let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { 32 } else { 31 });
@@ -416,7 +417,8 @@ fn print(line: &str) {
     print_shown(&text::shown(line));
 }
 
-/// Prints on stdout what is safe. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+/// Prints sanitised text on stdout. A closed reader (`| head`) ends the program without an error; a full disk is an
+/// error.
 fn print_shown(line: &str) {
     let mut out = std::io::stdout().lock();
     if let Err(error) = writeln!(out, "{line}").and_then(|()| out.flush()) {
@@ -444,7 +446,7 @@ pub(crate) fn log_time() {
     LOG_TIME.store(true, Ordering::Relaxed);
 }
 
-/// A line with the time before it, where that is wanted.
+/// A line with the time before it, where that is needed.
 fn stamped(line: &str) -> Cow<'_, str> {
     match LOG_TIME.load(Ordering::Relaxed) {
         true => format!("{} {line}", rfc3339(SystemTime::now())).into(),
@@ -476,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn trouble_and_verdict_have_colours() {
+    fn problems_and_verdict_are_coloured() {
         let text = "cameras          3\n  ! one is dark\n! no points\ndoes not look healthy";
         let painted = painted(text, false);
         assert_eq!(

@@ -1,7 +1,7 @@
-//! Ctrl-C: the first asks to stop (training saves a checkpoint), the second ends the program at once.
+//! Ctrl-C: the first requests a stop (training saves a checkpoint), the second ends the program at once.
 //!
-//! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under temporary names,
-//! and locks of dead processes are taken over, so that the same command goes on.
+//! Work that does not poll for the stop (`ends`) is ended after a moment: all files are written under temporary names,
+//! and locks of dead processes are taken over, so that the same command continues.
 
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,15 +12,15 @@ use std::time::Duration;
 const ENDED_BY_INTERRUPT: i32 = 130;
 /// Exit code of interrupted work (docs/exit-codes.md).
 const INTERRUPTED: i32 = 1;
-/// Time for work that asks; people wait two seconds.
+/// Time for work that polls; users accept two seconds.
 const PATIENCE: Duration = Duration::from_millis(1200);
 
-/// What a Ctrl-C does now.
+/// Current effect of Ctrl-C.
 struct State {
     raised: bool,
-    /// What is said of the first one.
+    /// Message on the first one.
     first: Cow<'static, str>,
-    /// Where the program is ended soon: what is said then.
+    /// Where the program ends soon: the message then.
     last: Option<String>,
     /// Whether another program has called, which must not be ended.
     embedded: bool,
@@ -33,14 +33,14 @@ fn state() -> MutexGuard<'static, State> {
     STATE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What follows a Ctrl-C.
+/// Effects of Ctrl-C.
 #[derive(Debug, PartialEq)]
 enum Reaction {
     /// The program ends now.
     Exit,
-    /// The work stops by itself.
+    /// The work stops on request.
     Stops,
-    /// The work may stop by itself; if it does not soon, the program ends with these words.
+    /// The work may stop on request; otherwise the program soon ends with this message.
     Ends(String),
 }
 
@@ -56,7 +56,7 @@ impl State {
     }
 }
 
-/// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then said on stderr.
+/// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then printed on stderr.
 pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let raised = flag.clone();
@@ -78,14 +78,14 @@ pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     flag
 }
 
-/// From now on the work asks for the flag, and does what `first` says.
+/// From now on the work reads the flag and does what `first` states.
 pub(crate) fn stop_polled(first: impl Into<Cow<'static, str>>) {
     let mut state = state();
     (state.first, state.last) = (first.into(), None);
 }
 
-/// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and how to go
-/// on. A Ctrl-C that came before, and that nothing has followed, ends it now.
+/// From now on a Ctrl-C ends the program after a moment, also where the work does not read the flag; `last` states what
+/// is kept and how to continue. An earlier Ctrl-C without effect ends it now.
 pub(crate) fn stop_not_polled(last: impl Into<String>) {
     let last = last.into();
     let mut state = state();

@@ -1,7 +1,8 @@
 //! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each command is a file in `verbs`: it parses, calls `splat4d-workflow` and prints. Exit codes: 0 done, 1 failed, 2 bad input.
-//! This is a library only because the studies and the Python package share its console; its interface is not public.
+//! Each command is a file in `verbs`: it parses, calls `splat4d-workflow` and prints. Exit codes: 0 done, 1 failed, 2
+//! bad input. This is a library only because the studies and the Python package share its console; its interface is not
+//! public.
 //!
 //! # Code map
 //!
@@ -59,7 +60,7 @@ Examples:
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
-/// What `--version` prints: another program has a command of this name.
+/// Output of `--version`: another program has a command of this name.
 const VERSION: &str = concat!(
     env!("CARGO_PKG_VERSION"),
     "\nwrites .s4d, also installed as s4d: https://github.com/splat4d/splat4d\n\
@@ -144,7 +145,7 @@ impl Verb {
     }
 }
 
-/// The command: parses the program's arguments, runs the verb and says how it went.
+/// The command: parses the program's arguments, runs the verb and reports the result.
 pub fn main() -> ExitCode {
     main_from(std::env::args_os()).into()
 }
@@ -154,8 +155,8 @@ pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
     parsed_from(words, |cli: Cli| (cli.globals, move |console: &Console| cli.verb.run(console)))
 }
 
-/// One verb with its options, for another program: prints nothing but warnings, and returns the objects that `--json` would
-/// print, or the error.
+/// One verb with its options, for another program: prints nothing but warnings, and returns the objects that `--json`
+/// would print, or the error.
 pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     let name = OsString::from("splat4d");
     let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| {
@@ -185,7 +186,7 @@ where
     let (globals, work) = match C::try_parse_from(words) {
         Ok(cli) => work(cli),
         Err(error) => {
-            // clap shows the words as they are: a file's name may hold an escape sequence.
+            // clap prints arguments unescaped: a file's name may contain an escape sequence.
             let text = error.to_string();
             if text.contains(|c| splat4d::text::acts(c) && c != '\n') {
                 console::eprint_line(text.trim_end());
@@ -219,12 +220,12 @@ fn threads(count: Option<u16>) -> anyhow::Result<()> {
         rayon::ThreadPoolBuilder::new()
             .num_threads(count.into())
             .build_global()
-            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Ask for fewer."))?;
+            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Request fewer."))?;
     }
     Ok(())
 }
 
-/// The error and its causes, but no cause whose words were said already.
+/// The error and its causes, but no cause whose text was printed already.
 pub fn error_text(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |mut said, cause| {
         if said.is_empty() {
@@ -236,8 +237,8 @@ pub fn error_text(error: &anyhow::Error) -> String {
     })
 }
 
-/// 2 where the user's data, files or options are at fault, 1 for everything else: also for what the machine cannot, such as
-/// write to a full disk.
+/// 2 where the user's data, files or options are at fault, 1 for everything else: also for what the machine cannot,
+/// such as write to a full disk.
 fn exit_code(error: &anyhow::Error) -> u8 {
     if error.downcast_ref::<Error>().is_some_and(Error::is_users) { BAD_INPUT } else { FAILED }
 }

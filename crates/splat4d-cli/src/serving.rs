@@ -1,9 +1,9 @@
-//! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
+//! The player's server as verbs use it: options, its messages, the browser, and a run that is being watched.
 
 use crate::console::Console;
 use serde_json::{Value, json};
 use splat4d::{Error, Result};
-use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
+use splat4d_serve::{Config, EditResponse, Editing, News, Running, Server};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Event as Training;
 use splat4d_train::run::Stopwatch;
@@ -18,14 +18,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// How often a waiting program looks whether Ctrl-C was pressed.
-const LOOK: Duration = Duration::from_millis(50);
-/// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page needs to update.
+/// How often a waiting program checks for Ctrl-C.
+const POLL: Duration = Duration::from_millis(50);
+/// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page
+/// needs to update.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 /// Time for the last news to reach pages before the server ends.
 const FAREWELL: Duration = Duration::from_millis(250);
 
-/// Where to serve.
+/// Address of the server.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct Place {
     /// Port of the page; 0: any free one [default: 4440, or a free one after it]
@@ -43,8 +44,8 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// Whether any of it was said.
-    pub(crate) fn is_told(&self) -> bool {
+    /// Whether any of it was printed.
+    pub(crate) fn is_printed(&self) -> bool {
         self.port.is_some() || self.host.is_some() || self.no_open || self.player_folder.is_some()
     }
 }
@@ -57,14 +58,14 @@ pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, cons
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
     // Behind `#` a browser sends nothing to other sites, and linked pages do not see it.
     let url = token.map_or(running.url().to_owned(), |token| format!("{}#{right}={token}", running.url()));
-    console.say(&format!("the player is at {url}"));
+    console.print_line(&format!("the player is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
         console.warn("every computer that reaches this machine over the network can view the scene.");
     }
     if !place.no_open && !open_browser(&url) {
         let port = running.address().port();
-        console.say(&format!(
+        console.print_line(&format!(
             "this machine has no screen. On your own computer: ssh -L {port}:localhost:{port} {}, then open \
              http://localhost:{port}/{}",
             machine(),
@@ -77,7 +78,7 @@ pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, cons
 /// Waits for Ctrl-C.
 pub(crate) fn wait(stop: &AtomicBool) {
     while !stop.load(Ordering::SeqCst) {
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL);
     }
 }
 
@@ -111,7 +112,7 @@ fn open_browser(url: &str) -> bool {
     }
 }
 
-/// Pause and stop of a run, as its page asks for them.
+/// Pause and stop of a run, as its page requests them.
 ///
 /// A pause blocks the trainer between two steps, so that the result stays the same to the bit.
 #[derive(Debug)]
@@ -119,7 +120,7 @@ pub(crate) struct Control {
     stop: Arc<AtomicBool>,
     paused: AtomicBool,
     began: Instant,
-    /// Time of all pauses so far.
+    /// Total time of pauses.
     waited: Mutex<Duration>,
 }
 
@@ -148,13 +149,13 @@ impl Control {
     fn wait(&self) {
         let began = Instant::now();
         while self.is_paused() {
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL);
         }
         *self.waited.lock().unwrap_or_else(PoisonError::into_inner) += began.elapsed();
     }
 
-    /// Does what a page asks for.
-    fn answer(&self, asked: &Value) -> Result<EditAnswer> {
+    /// Does what a page requests.
+    fn answer(&self, asked: &Value) -> Result<EditResponse> {
         let state = match asked["do"].as_str() {
             Some("pause") => "pausing",
             Some("continue") => "training",
@@ -165,11 +166,12 @@ impl Control {
             _ => return Err(Error::input("unknown request of the page").remedy("Reload the page")),
         };
         self.paused.store(state == "pausing", Ordering::SeqCst);
-        Ok(EditAnswer { told: json!({ "state": state }), scene: None })
+        Ok(EditResponse { told: json!({ "state": state }), scene: None })
     }
 }
 
-/// A listener that passes events to the console and, with `--view`, to a page. What fails with the page never costs the run.
+/// A listener that passes events to the console and, with `--view`, to a page. What fails with the page never costs the
+/// run.
 pub(crate) struct Watched<'a> {
     console: &'a Console,
     place: Option<&'a Place>,
@@ -202,8 +204,8 @@ impl<'a> Watched<'a> {
         Self { console, place, control: control.clone(), running: OnceCell::new(), held_out: Cell::new(None) }
     }
 
-    /// Starts to serve a run that is about to train; a server that cannot be started is a warning. The capture's cameras and images
-    /// are shown next to the render, where it can be opened.
+    /// Starts to serve a run that is about to train; a server that cannot be started is a warning. The capture's
+    /// cameras and images are shown next to the render, where it can be opened.
     fn begin(&self, title: &str, run: &Path, capture: Option<&Arc<Capture>>) {
         let Some(place) = self.place else { return };
         let of_run = || Some(Arc::new(Run::open(run).ok()?.open_capture().ok()?.0));
@@ -301,7 +303,7 @@ mod tests {
                 waiting.wait();
                 (clock.seconds() - before, began.elapsed().as_secs_f64())
             });
-            std::thread::sleep(3 * LOOK);
+            std::thread::sleep(3 * POLL);
             assert!(!trainer.is_finished(), "it waits");
             ask(way).unwrap();
             let (counted, passed) = trainer.join().unwrap();

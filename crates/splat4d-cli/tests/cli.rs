@@ -21,7 +21,7 @@ mod predict;
 #[path = "cli/sample.rs"]
 mod sample;
 
-use sample::{Answer, Capture, splat4d};
+use sample::{Capture, Output, splat4d};
 use serde_json::{Value, json};
 use splat4d::format::npy::Npy;
 use splat4d::format::ply;
@@ -39,7 +39,7 @@ const TINY: [&str; 6] = [
     "--seed=3",
 ];
 
-fn train(capture: &Path, run: &Path) -> Answer {
+fn train(capture: &Path, run: &Path) -> Output {
     splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).run()
 }
 
@@ -73,7 +73,7 @@ fn help_has_examples_and_completions_complete() {
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
     }
-    // Options of every verb stand under their own heading, behind the verb's.
+    // Common options have their own heading, after the verb's.
     let own = splat4d(&["predict", "--help"]).run().ok();
     let (of_verb, global) = own.split_once("Global options:").expect("a heading");
     assert!(of_verb.contains("--horizon") && !of_verb.contains("--threads") && global.contains("--threads"), "{own}");
@@ -133,7 +133,7 @@ fn images_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
 }
 
 #[test]
-fn a_capture_becomes_a_run_and_everything_follows() {
+fn a_capture_is_trained_evaluated_and_exported() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
@@ -184,7 +184,7 @@ fn a_capture_becomes_a_run_and_everything_follows() {
     let cached = splat4d(&["eval", str(&run), "--baseline", "--no-film", "--json"]).run().ok();
     assert!(!cached.contains("\"started\""), "the baseline is trained once");
 
-    // eval of other views; what the capture does not have is refused.
+    // eval of other views; missing splits are refused.
     let lines = splat4d(&["eval", str(&run), "--split", "train", "--json"]).run().ok();
     let lines: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     let scores = lines.iter().find(|e| e["type"] == "results").unwrap();
@@ -365,7 +365,7 @@ fn one_gaussian(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
+fn a_page_embeds_or_links_its_scene() {
     let work = tempfile::tempdir().unwrap();
     let (file, page) = (one_gaussian(work.path()), work.path().join("page.html"));
     splat4d(&["export", str(&file), "--html", "-o", str(&page)]).run().ok();
@@ -378,7 +378,7 @@ fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
     let html = std::fs::read_to_string(&page).unwrap();
     assert!(html.contains("./a%20b.s4d") && !html.contains("id=\"splat4d-scene\">"));
     assert!(std::fs::read(&linked).unwrap().starts_with(b"\x89S4D"));
-    // A playback file is taken as it is.
+    // A playback file is used unchanged.
     let again = work.path().join("again.s4d");
     splat4d(&["export", str(&linked), "--html", "-o", str(&page), "--link", str(&again)]).run().ok();
     assert_eq!(std::fs::read(&linked).unwrap(), std::fs::read(&again).unwrap());
@@ -388,7 +388,7 @@ fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
     assert!(refused.contains("--link"), "{refused}");
 }
 
-/// Body of the answer of a server at `url`.
+/// Body of the response of a server at `url`.
 fn get(url: &str, path: &str) -> Vec<u8> {
     use std::io::{Read, Write};
     // What follows # stays in the browser: the page's token.
@@ -432,7 +432,7 @@ fn a_scene_is_served_until_an_interrupt() {
 }
 
 #[test]
-fn a_run_is_watched_and_trains_without_a_server_too() {
+fn training_runs_with_and_without_a_live_server() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = |name: &str| work.path().join(name);
@@ -633,7 +633,7 @@ fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     let out = work.path().join("now.ply");
     splat4d(&["export", str(&file), "-o", str(&out), "--time", "0.3"]).run().ok();
     let (params, _) = ply::read(&std::fs::read(&out).unwrap()).unwrap();
-    // It moves at 2 units a second and was at x = 1 at 0.25 s.
+    // It moves at 2 units per second and was at x = 1 at 0.25 s.
     assert_eq!(params.len(), 2);
     assert!((params[GEOMETRY].get(1, 0) - 1.1).abs() < 1e-3, "{}", params[GEOMETRY].get(1, 0));
 

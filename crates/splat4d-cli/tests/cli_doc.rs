@@ -58,7 +58,7 @@ fn text(page: &Page, all: &Command) -> String {
     text
 }
 
-/// A command: what it does, how it is called, its options by heading, its examples.
+/// A command: its purpose, usage, options by heading, its examples.
 fn section(mut command: Command) -> String {
     let about = command.get_about().map(ToString::to_string).unwrap_or_default();
     let usage = command.render_usage().to_string();
@@ -131,7 +131,7 @@ fn cell(text: &str) -> String {
 }
 
 #[test]
-fn the_reference_is_what_the_command_accepts() {
+fn the_reference_equals_the_options_of_the_command() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let mut all = splat4d_cli::command();
     all.build();

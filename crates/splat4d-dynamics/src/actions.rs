@@ -1,4 +1,4 @@
-//! Actions: what is done to a scene, a row of named numbers a frame.
+//! Actions: what is done to a scene, a row of named numbers per frame.
 //!
 //! Columns `NAME.x`, `NAME.y`, `NAME.z` that follow each other are one vector in the world, which turns with it; other
 //! columns are scalars. Row t acts between frame t and the next.
@@ -8,7 +8,7 @@ use splat4d::{Error, Result};
 /// Most columns.
 pub const MAX_COLUMNS: usize = 8;
 
-/// Rows of named numbers, one a frame from the first observed one on.
+/// Rows of named numbers, one per frame from the first observed one on.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Actions {
     /// Names of the columns.
@@ -18,9 +18,10 @@ pub struct Actions {
 }
 
 impl Actions {
-    /// Reads a table as CSV: a header of names, then a row a frame.
+    /// Reads a table as CSV: a header of names, then a row per frame.
     ///
-    /// Errors: no header, too many columns, a name twice, a part of a vector without the others, a row of another length, a number that is none.
+    /// Errors: no header, too many columns, a duplicate name, a part of a vector without the others, a row of another
+    /// length, a number that is none.
     pub fn parse(text: &str) -> Result<Self> {
         let bad = |what: String| {
             Error::input(what).remedy("Write a header of column names, then one row of numbers a frame, commas between")

@@ -1,10 +1,10 @@
-//! Correction by what comes in: predict, draw, compare, update.
+//! Correction by new images: predict, render, compare, update.
 //!
-//! A forecast of the next frame is drawn from the cameras and compared with their images; some steps of gradient
-//! descent on
-//! the nodes' poses alone make an observation of it. Forecast and observation are fused node by node with a scalar gain
-//! (the Kalman form with separate variances): K = P/(P + R), x ← x + K (x_o − x), P ← (1 − K) P, and before the next frame
-//! P ← P + Q, where Q is what an ensemble's variance grows by in a frame, and R the variance of an observation.
+//! A forecast of the next frame is rendered from the cameras and compared with their images; some steps of gradient
+//! descent on the nodes' poses alone make an observation of it. Forecast and observation are fused node by node with a
+//! scalar gain (the Kalman form with separate variances): K = P/(P + R), x ← x + K (x_o − x), P ← (1 − K) P, and before
+//! the next frame P ← P + Q, where Q is what an ensemble's variance grows by in a frame, and R the variance of an
+//! observation.
 
 use crate::future::{Clock, predicted};
 use crate::nodes::Observed;
@@ -53,13 +53,14 @@ impl<'a> Filter<'a> {
         (OBSERVED * self.observed.size).powi(2)
     }
 
-    /// The time of the frame that [`update`](Self::update) compares with, whatever its own: poses are given, not evaluated by time.
+    /// The time of the frame that [`update`](Self::update) compares with, whatever its own: poses are given, not
+    /// evaluated by time.
     pub fn time(&self) -> f64 {
         self.clock.at(1)
     }
 
-    /// The forecast of a frame, corrected by its images (`frames`, all at [`time`](Self::time)), which `backend` draws.
-    /// `growth`: how much the variance of each node's forecast grew since the frame before, (scene units)².
+    /// The forecast of a frame, corrected by its images (`frames`, all at [`time`](Self::time)), which `backend`
+    /// renders. `growth`: how much the variance of each node's forecast grew since the frame before, (scene units)².
     ///
     /// Errors: images that cannot be read, a scene that cannot be carried, a step that is not finite.
     pub fn update(

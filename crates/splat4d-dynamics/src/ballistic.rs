@@ -9,12 +9,12 @@ pub(crate) const WINDOW: usize = 5;
 /// Share of the acceleration that is left after a frame.
 pub(crate) const DAMPING: f64 = 0.9;
 
-/// The last time for ever.
+/// The last state, constant.
 pub(crate) fn freeze(paths: &Paths, horizon: usize) -> Vec<Moment> {
     vec![paths.last().clone(); horizon]
 }
 
-/// The last time goes on with the velocities and turns of the last frames, and with accelerations that fade by
+/// The last time continues with the velocities and turns of the last frames, and with accelerations that fade by
 /// `damping` a frame; without `damping` with none.
 pub(crate) fn ballistic(paths: &Paths, horizon: usize, damping: Option<f64>) -> Vec<Moment> {
     let rates: Vec<Rates> = (0..paths.nodes()).map(|k| Rates::of(paths, k, damping.is_some())).collect();

@@ -1,12 +1,12 @@
-//! M2: a causal diagonal state space of every node on vector channels, which is exactly equivariant: linear recurrences in
-//! time commute with rotations (after Gu et al. 2022, "S4D", and Deng et al. 2021, "Vector neurons").
+//! M2: a causal diagonal state space of every node on vector channels, which is exactly equivariant: linear recurrences
+//! in time commute with rotations (after Gu et al. 2022, "S4D", and Deng et al. 2021, "Vector neurons").
 //!
-//! Inputs u of a node are vectors: its velocity, the mean velocity of its neighbours, their mean offset, gravity, and those
-//! of actions. With complex channels and z = −exp(a) + iω, one tick is
+//! Inputs u of a node are vectors: its velocity, the mean velocity of its neighbours, their mean offset, gravity, and
+//! those of actions. With complex channels and z = −exp(a) + iω, one tick is
 //!
 //! > h ← e^z h + B u, y = Re(W h) + D u, acceleration = A Σ_o φ_o(|y|², y·v, e, scalars) y_o.
 //!
-//! Re z < 0, so that |e^z| < 1: what is remembered fades, whatever is learnt. It looks at the past alone.
+//! Re z < 0, so that |e^z| < 1: memory fades for any weights. It depends on the past alone.
 
 use crate::learnt::{Action, Network, Scales, State, put, row};
 use crate::optimise::no_gaussians;
@@ -36,11 +36,11 @@ const FIRST: f64 = 0.1;
 pub struct CausalSpec {
     /// Complex channels.
     pub channels: usize,
-    /// Vectors that come out of them.
+    /// Output vectors.
     pub outputs: usize,
     /// Hidden numbers of the gates.
     pub width: usize,
-    /// Unit vector along which things fall.
+    /// Unit vector of gravity.
     pub gravity: Option<[f64; 3]>,
     /// Vectors and scalars of an action.
     pub actions: [usize; 2],
@@ -87,7 +87,7 @@ fn axpy<F: Real>(to: &mut [F; 3], s: F, a: [F; 3]) {
 }
 
 impl CausalNet {
-    /// A network for nodes that lie like `rest`, and its weights. Errors: a width that no perceptron has.
+    /// A network for nodes positioned like `rest`, and its weights. Errors: a width that no perceptron has.
     pub fn new<F: Real>(spec: CausalSpec, scales: Scales, rest: &Moment, seed: u64) -> Result<(Self, Params<F>)> {
         let mut p = no_gaussians();
         let rng = |part: u64| Rng::new(seed, "causal", part);

@@ -1,5 +1,5 @@
-//! The predicted scene: up to the last observed time the scene as it was learnt, after it what moves is carried on by
-//! the nodes, with the looks of that time, among the static background.
+//! The predicted scene: up to the last observed time the learnt scene, after it dynamic regions are moved by the nodes,
+//! with the appearance of that time, in the static background.
 
 use crate::nodes::Observed;
 use crate::paths::{Moment, Paths};
@@ -17,7 +17,7 @@ use std::sync::Arc;
 /// Nodes that carry a Gaussian.
 const CARRIERS: usize = 4;
 
-/// When the observed part ends and how fast time goes on.
+/// When the observed part ends and how fast time continues.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Clock {
     /// The last observed time, seconds.
@@ -38,7 +38,7 @@ impl Clock {
     }
 }
 
-/// The scene that goes on as predicted: `moments` are the frames after the last observed one.
+/// The predicted scene: `moments` are the frames after the last observed one.
 ///
 /// Its layers are the scene's, which end at the last observed time, and for each of them up to two that begin there:
 /// what is static ([`PREDICTED`] and the layer's name), and what moves, as a `control` layer whose nodes have given

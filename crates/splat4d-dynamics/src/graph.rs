@@ -1,15 +1,17 @@
 //! M3: accelerations of nodes by messages along edges, equivariant under rotations and translations of the whole scene
 //! (after Satorras et al. 2021, "E(n) equivariant graph neural networks").
 //!
-//! With r = x_j − x_k, ℓ = |r|, w = v_j − v_k along an edge, unit gravity g and vectors u of actions, invariants
-//! s = (ℓ/L, (ℓ − rest)/S, |w|²/S², r·w/(ℓS), r·g/L) of edges and (|v|²/S², v·g/S, height/L, |u|², u·v/S, scalars) of nodes:
+//! With r = x_j − x_k, ℓ = |r|, w = v_j − v_k along an edge, unit gravity g and vectors u of actions, invariants s =
+//! (ℓ/L, (ℓ − rest)/S, |w|²/S², r·w/(ℓS), r·g/L) of edges and (|v|²/S², v·g/S, height/L, |u|², u·v/S, scalars) of
+//! nodes:
 //!
 //! > h⁰ = φ_in(e, node's invariants), m_kj = φ_e(h_k, h_j, s), h_k ← h_k + φ_h(h_k, Σ_j m_kj / √8),
 //! > a_k / A = Σ_j (r/ℓ·c₁ + w/S·c₂) + v_k/S·c₃ + g·c₄ + Σ u·c₅, (c₁, c₂) = φ_x(h_k + h_j, s₁₋₄), (c₃…) = φ_v(h_k).
 //!
-//! φ_x sees what both ends share, so that forces along edges are opposite and equal; without the node's terms (`momentum`)
-//! Σ v is conserved. Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). L, S and A are the scales of
-//! positions, velocities and accelerations as observed. Positions enter only as differences, and as height over a floor.
+//! φ_x uses only features that both ends share, so that forces along edges are opposite and equal; without the node's
+//! terms (`momentum`) Σ v is conserved. Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). L, S and
+//! A are the scales of positions, velocities and accelerations as observed. Positions enter only as differences, and as
+//! height over a floor.
 
 #[cfg(test)]
 mod tests;
@@ -47,7 +49,7 @@ pub struct GraphSpec {
     pub width: usize,
     /// Rounds of messages.
     pub layers: usize,
-    /// Unit vector along which things fall.
+    /// Unit vector of gravity.
     pub gravity: Option<[f64; 3]>,
     /// Height of the floor against gravity, scene units.
     pub floor: Option<f64>,
@@ -58,7 +60,7 @@ pub struct GraphSpec {
 }
 
 impl Default for GraphSpec {
-    /// 64 numbers, four rounds, nothing known of the world.
+    /// 64 numbers, four rounds, no prior knowledge of the world.
     fn default() -> Self {
         Self { width: 64, layers: 4, gravity: None, floor: None, momentum: false, actions: [0, 0] }
     }
@@ -101,7 +103,7 @@ struct Edge<F> {
 }
 
 impl GraphNet {
-    /// A network for nodes that lie like `rest`, and its weights.
+    /// A network for nodes positioned like `rest`, and its weights.
     ///
     /// Errors: a width or a number of layers that no perceptron has.
     pub fn new<F: Real>(spec: GraphSpec, scales: Scales, rest: &Moment, seed: u64) -> Result<(Self, Params<F>)> {
@@ -193,7 +195,7 @@ impl GraphNet {
         }
     }
 
-    /// Input of the first map, a row a node.
+    /// Input of the first map, a row per node.
     fn own_inputs<F: Real>(&self, p: &Params<F>, s: &State<F>, actions: &[Action<F>]) -> Vec<F> {
         let (n, [vectors, _]) = (self.ties.len(), self.spec.actions);
         let [l, v1] = [self.scales.length, self.scales.velocity].map(|x| F::of(1.0 / x));

@@ -1,15 +1,15 @@
 //! M1: a linear model of all nodes together by optimised dynamic mode decomposition (Askham and Kutz 2018), stable by
 //! construction.
 //!
-//! Poses of all nodes at a tick are one vector y: positions, and rotation matrices times a length, so that a turn weighs as what
-//! it moves; what turns evenly has the frequency that its places have, where its quaternion would have half of it. The model is
-//! y(t) = b + Σ_j e^(−a_j² t) (c_j cos ω_j t + s_j sin ω_j t): every eigenvalue e^(−a² ± iω) is within the unit circle, so that
-//! no rollout grows. Decays and frequencies are fitted to all observed ticks at once by variable projection (Golub and Pereyra
-//! 1973, with Kaufman's Jacobian 1975) on the principal components of y, pair by pair, each from the frequency that explains most
-//! of what is left. Regression from tick to tick, with delays or without, is biased towards decay by noise (Dawson et al. 2016),
-//! which nodes that were learnt from images have; a fit of whole paths is not. How many pairs there are is chosen by
-//! forecasts
-//! from several ticks of the past. What the model leaves of the last tick fades as such remainders faded so far.
+//! Poses of all nodes at a tick are one vector y: positions, and rotation matrices times a length, so that a turn
+//! weighs as what it moves; a steady rotation has the frequency of its positions, and its quaternion half of it. The
+//! model is y(t) = b + Σ_j e^(−a_j² t) (c_j cos ω_j t + s_j sin ω_j t): every eigenvalue e^(−a² ± iω) is within the
+//! unit circle, so that no rollout grows. Decays and frequencies are fitted to all observed ticks at once by variable
+//! projection (Golub and Pereyra 1973, with Kaufman's Jacobian 1975) on the principal components of y, pair by pair,
+//! each from the frequency that explains most of what is left. Regression from tick to tick, with delays or without, is
+//! biased towards decay by noise (Dawson et al. 2016), which nodes that were learnt from images have; a fit of whole
+//! paths is not. How many pairs there are is chosen by forecasts from several ticks of the past. The residual of the
+//! last tick decays as earlier residuals did.
 
 use crate::paths::{Moment, Paths, Pose, nearest};
 use nalgebra::{DMatrix, DVector};
@@ -25,8 +25,8 @@ const COMPONENTS: usize = 16;
 const PAIRS: usize = 8;
 /// Ticks that there must be for every number that is fitted to a path.
 const TICKS_A_NUMBER: usize = 3;
-/// Shares of the observed ticks from whose ends forecasts are tried, how far these go, and the fewest ticks to start from. The
-/// median decides: a fit to half of the ticks can miss by far.
+/// Shares of the observed ticks at whose ends trial forecasts start, their length, and the fewest ticks to start from.
+/// The median decides: a fit to half of the ticks can miss by far.
 const STARTS: [f64; 7] = [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8];
 const AHEAD: f64 = 0.2;
 const FEWEST: usize = 4;
@@ -36,9 +36,10 @@ const SHORTEST: f64 = 4.0;
 const FINENESS: usize = 4;
 /// √ of the decay a tick that a new pair starts with.
 const DECAY: f64 = 0.01;
-/// Of the squares of a fitted column: what keeps columns apart that are nearly one.
+/// Of the squares of a fitted column: regularises columns that are nearly equal.
 const RIDGE: f64 = 1e-9;
-/// Steps of Levenberg and Marquardt, the damping that they begin with and what it changes by, and the gain that ends them.
+/// Steps of Levenberg and Marquardt, the damping that they begin with and what it changes by, and the gain that ends
+/// them.
 const STEPS: usize = 60;
 const DAMPING: f64 = 1e-3;
 const DAMPING_CHANGE: f64 = 10.0;
@@ -82,7 +83,7 @@ impl Koopman {
         Self::with(paths, best)
     }
 
-    /// The model of so many pairs.
+    /// The model of this many pairs.
     pub(crate) fn with(paths: &Paths, count: usize) -> Self {
         let components = components(&numbers(paths));
         Self { pairs: (0..count).fold(Vec::new(), |pairs, _| grown(&pairs, &components)) }
@@ -108,7 +109,7 @@ impl Koopman {
     }
 }
 
-/// How many pairs so many ticks determine: one at least.
+/// How many pairs this many ticks determine: one at least.
 fn most_pairs(ticks: usize) -> usize {
     ((ticks / TICKS_A_NUMBER).saturating_sub(1) / 2).clamp(1, PAIRS)
 }
@@ -144,7 +145,7 @@ impl Projection {
         self.gram.solve(&(self.a.transpose() * y))
     }
 
-    /// What the columns leave of y.
+    /// Residual of y after the columns.
     fn rest(&self, y: &DMatrix<f64>) -> DMatrix<f64> {
         y - &self.a * self.amounts(y)
     }
@@ -238,8 +239,8 @@ fn components(y: &DMatrix<f64>) -> DMatrix<f64> {
     DMatrix::from_fn(y.nrows(), count, |t, c| eigen.eigenvectors[(t, order[c])] * values[c].sqrt())
 }
 
-/// How far a turn of a node reaches: the mean distance of nodes from their neighbours, scene units; of a single node, how far
-/// it goes.
+/// How far a turn of a node reaches: the mean distance of nodes from their neighbours, scene units; of a single node,
+/// how far it moves.
 fn reach(paths: &Paths) -> f64 {
     let rest = paths.last();
     let near = nearest(rest, NEIGHBOURS);
@@ -322,7 +323,7 @@ mod tests {
             let error = error_after(&model, 0.0, 0.11, h);
             assert!(error < 1e-4 * h as f64, "{error} after {h}");
         }
-        // Something that grows: fitted as it is, its rollout would reach e^50.
+        // A growing signal: fitted without a bound, its rollout would reach e^50.
         let point = |t: usize| [(0.05 * t as f64).exp(), 0.0, (0.3 * t as f64).sin()];
         let growing = Paths::of_points(&(0..50).map(|t| vec![point(t), point(t + 3)]).collect::<Vec<_>>());
         let out = Koopman::fit(&growing).rollout(&growing, 1000);

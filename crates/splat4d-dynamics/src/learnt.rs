@@ -1,7 +1,7 @@
 //! Networks that predict accelerations: their interface, training over whole rollouts, and forecasts.
 //!
-//! Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). A network may remember (`hidden`): then it first
-//! sees the ticks before a window as they were observed.
+//! Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). A network may remember (`hidden`): then it
+//! first processes the observed ticks before a window.
 
 use crate::actions::Actions;
 use crate::optimise::Optimiser;
@@ -33,25 +33,25 @@ pub struct State<F> {
 }
 
 impl<F: Real> State<F> {
-    /// Zeros for so many rows.
+    /// Zeros for this many rows.
     pub(crate) fn zeros(rows: usize) -> Self {
         Self { x: vec![F::ZERO; 3 * rows], v: vec![F::ZERO; 3 * rows] }
     }
 }
 
-/// What acts on a copy, scaled: vectors \[3 each], then scalars.
+/// Scaled inputs of a copy: vectors \[3 each], then scalars.
 pub type Action<F> = Vec<F>;
 
 /// A network whose weights are in a [`Params`].
 pub trait Network: Clone {
-    /// What a step's backward needs.
+    /// State for a step's backward.
     type Tape<F: Real>: Default;
 
     /// Nodes.
     fn nodes(&self) -> usize;
     /// Sizes that it was made for.
     fn scales(&self) -> Scales;
-    /// Ticks that it wants to have seen before it forecasts.
+    /// Ticks that it needs before a forecast.
     fn warm_up(&self) -> usize {
         0
     }
@@ -59,7 +59,8 @@ pub trait Network: Clone {
     fn memory(&self) -> usize {
         0
     }
-    /// Accelerations \[rows, 3], scene units a frame²; moves `hidden` \[rows, memory] on by a tick. `actions`: one a copy.
+    /// Accelerations \[rows, 3], scene units a frame²; moves `hidden` \[rows, memory] on by a tick. `actions`: one a
+    /// copy.
     fn accelerations<F: Real>(
         &self,
         p: &Params<F>,
@@ -68,8 +69,8 @@ pub trait Network: Clone {
         hidden: &mut Vec<F>,
         tape: &mut Self::Tape<F>,
     ) -> Vec<F>;
-    /// The VJP of [`accelerations`](Self::accelerations): adds to `d_state` and the weights' gradients, and turns the gradient
-    /// to `hidden` after the tick into that before it.
+    /// The VJP of [`accelerations`](Self::accelerations): adds to `d_state` and the weights' gradients, and turns the
+    /// gradient to `hidden` after the tick into that before it.
     fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -115,16 +116,17 @@ const FADE: f64 = 0.95;
 const VELOCITY_WEIGHT: f64 = 0.1;
 /// Up to this share of L errors count by their square, beyond by themselves (Huber).
 const HUBER: f64 = 0.01;
-/// Noise on the positions that a window starts from, of L, and on its velocities, of S; gone after this share of the steps.
+/// Noise on the positions that a window starts from, of L, and on its velocities, of S; zero after this share of the
+/// steps.
 const NOISE: [f64; 2] = [0.003, 0.1];
 const NOISE_UNTIL: f64 = 1.0 / 3.0;
-/// Rows that a step looks at, about: windows are as many as make them up, at most so many.
+/// Approximate rows of a step: the number of windows follows from it, at most this many.
 const ROWS: usize = 96;
 const MOST_WINDOWS: usize = 8;
-/// In forecasts no acceleration is larger than this multiple of the largest that was observed: what was never seen drifts
-/// and does not explode.
+/// In forecasts no acceleration is larger than this multiple of the largest that was observed: what was never seen
+/// drifts and does not explode.
 const STEEPEST: f64 = 3.0;
-/// Smallest scale of velocities and accelerations, of L: what does not move has no scale of its own.
+/// Smallest scale of velocities and accelerations, of L: static nodes have no scale of their own.
 const STILLEST: f64 = 1e-6;
 
 /// A trained network.
@@ -153,8 +155,8 @@ pub(crate) struct Window<F> {
 }
 
 impl<N: Network> Learnt<N> {
-    /// Learns from observed paths, and from the actions on them, with the network that `make` makes for scales, numbers of
-    /// vectors and scalars of an action, and a seed. Nothing after the last tick is examined.
+    /// Learns from observed paths, and from the actions on them, with the network that `make` makes for scales, numbers
+    /// of vectors and scalars of an action, and a seed. Nothing after the last tick is examined.
     ///
     /// Errors: fewer than [`LEAST_TICKS`] ticks; those of `make`.
     pub(crate) fn fit(
@@ -253,7 +255,7 @@ impl<N: Network> Learnt<N> {
         Window { before, state: first, actions, truth: (1..=horizon as isize).map(state).collect() }
     }
 
-    /// Ticks before a window: as many as the network wants, and at most a third of what there is.
+    /// Ticks before a window: as many as the network needs, and at most a third of what there is.
     fn warm_up(&self, paths: &Paths) -> usize {
         self.net.warm_up().min(paths.len() / 3)
     }
@@ -371,7 +373,7 @@ pub(crate) fn rollout_loss<N: Network, F: Real>(
             let d_a = d_state.v.clone();
             net.backward(p, tape, &d_a, &mut d_state, &mut d_hidden, d);
         }
-        // What was observed has no gradient, but what it left in memory came by the weights.
+        // Observations have no gradient, but the memory state depends on the weights.
         let (nothing, mut unused) = (vec![F::ZERO; 3 * rows], State::zeros(rows));
         for tape in warm.iter().rev() {
             net.backward(p, tape, &nothing, &mut unused, &mut d_hidden, d);
@@ -380,7 +382,8 @@ pub(crate) fn rollout_loss<N: Network, F: Real>(
     (loss, d_state)
 }
 
-/// weight · Σ ρ(|found − truth|) over rows, and its gradient; ρ is half the square below [`HUBER`] · length, in its units.
+/// weight · Σ ρ(|found − truth|) over rows, and its gradient; ρ is half the square below [`HUBER`] · length, in its
+/// units.
 fn huber<F: Real>(found: &[F], truth: &[F], weight: f64, length: f64, d: &mut [F]) -> F {
     let (weight, delta, half) = (F::of(weight), F::of(HUBER * length), F::of(0.5));
     let mut sum = F::ZERO;

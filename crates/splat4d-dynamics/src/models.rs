@@ -1,4 +1,4 @@
-//! The ladder: every model that goes on from observed paths, by name, each a baseline for the next.
+//! The ladder: every model that continues from observed paths, by name, each a baseline for the next.
 
 use crate::actions::Actions;
 use crate::ballistic::{DAMPING, ballistic, freeze};
@@ -13,13 +13,13 @@ use splat4d::scene::Params;
 /// Rungs of the ladder, lowest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
-    /// B0: the last time for ever.
+    /// B0: the last state, constant.
     Freeze,
     /// B1: constant velocity and turn.
     Velocity,
     /// B2: acceleration that fades.
     Acceleration,
-    /// B3: what the motion model of the scene states of later times.
+    /// B3: the scene's motion model at later times.
     Extrapolate,
     /// M1: linear, with delays, stable by construction.
     Koopman,
@@ -61,12 +61,12 @@ impl Model {
     }
 }
 
-/// What is known of a world in addition to its paths, and how networks are trained.
+/// Data of a world next to its paths, and settings of training networks.
 #[derive(Clone, Debug, Default)]
 pub struct Settings {
     /// Steps and seed.
     pub training: Training,
-    /// Unit vector along which things fall, where it is to be used.
+    /// Unit vector of gravity, if it is used.
     pub gravity: Option<[f64; 3]>,
     /// Height of a floor, against gravity.
     pub floor: Option<f64>,
@@ -108,7 +108,7 @@ impl Fitted {
             Model::Velocity => Self::Ballistic(None),
             Model::Acceleration => Self::Ballistic(Some(DAMPING)),
             Model::Extrapolate => {
-                return Err(Error::input("forecasts of a motion model come from the scene, not from nodes")
+                return Err(Error::input("forecasts of a motion model are evaluated on the scene, not on nodes")
                     .remedy("Follow the nodes through the scene"));
             }
             Model::Koopman => Self::Koopman(Box::new(Linear(Koopman::fit(paths)))),

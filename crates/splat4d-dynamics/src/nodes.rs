@@ -1,8 +1,8 @@
 //! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
 //!
 //! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
-//! rigid motion that fits its members best. Where members fade (models whose Gaussians live for a moment), others around
-//! the node take over at the tick before, so that the node goes on although no Gaussian does.
+//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), others around the
+//! node take over at the tick before, so that the node continues although no Gaussian does.
 
 use crate::learnt::LEAST_TICKS;
 use crate::paths::{Moment, Paths, Pose};
@@ -23,7 +23,8 @@ pub const MAX_NODES: usize = 128;
 const MEMBERS: usize = 24;
 /// Fainter Gaussians carry nothing.
 const OPAQUE: f32 = 0.1;
-/// What is slower than this share of the scene's size a second is static: Gaussians of even surfaces drift unseen.
+/// Gaussians slower than this share of the scene's size per second are static: Gaussians of uniform surfaces drift
+/// unseen.
 const SPEED: f64 = 0.03;
 /// Of the opaque Gaussians: how many make up the scene's size.
 const CORE: f64 = 0.9;
@@ -33,7 +34,7 @@ const WORN: f32 = 0.5;
 const KEEP: f64 = 1e-3;
 /// A Gaussian farther from its neighbours than this multiple of the median carries no node: it floats alone.
 const LONELY: f32 = 3.0;
-/// Gaussians that were opaque at fewer ticks have no speed to speak of.
+/// Gaussians that were opaque at fewer ticks have no defined speed.
 const SEEN: u32 = 3;
 /// Neighbours whose majority states whether a Gaussian moves.
 const VOTERS: usize = 8;
@@ -55,7 +56,7 @@ struct Snapshot {
     alpha: Vec<f32>,
 }
 
-fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
+fn snapshot(scene: &Scene<f32>, t: f64) -> Snapshot {
     let (mut x, mut alpha) = (Vec::new(), Vec::new());
     for layer in &scene.layers {
         let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::All, Time(t));
@@ -70,8 +71,8 @@ fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
     Snapshot { x, alpha }
 }
 
-/// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one a frame), of which the last is
-/// the last observed one. Nothing is asked of the scene at any other time.
+/// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one per frame), of which the last is
+/// the last observed one. The scene is not evaluated at other times.
 ///
 /// Errors: too few ticks, no nodes or more than [`MAX_NODES`], nothing that moves.
 pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observed> {
@@ -82,7 +83,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     if !(1..=MAX_NODES).contains(&count) {
         return Err(Error::input(format!("{count} nodes cannot be")).remedy(format!("Give 1 to {MAX_NODES}")));
     }
-    let last = look(scene, ticks[ticks.len() - 1]);
+    let last = snapshot(scene, ticks[ticks.len() - 1]);
     let (middle, size) = extent(&last);
     let (fast, moving) = moving(scene, ticks, &last, size);
     let near = |x: &[f32; 3]| norm(sub(x.map(f64::from), middle)) <= 2.0 * size;
@@ -109,13 +110,13 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     Ok(Observed { moving: moving.collect(), paths: smooth(&Paths { moments }), size })
 }
 
-/// Follows nodes through a scene from where they are at the first of `ticks`, which may go either way: a time a tick.
+/// Follows nodes through a scene from their positions at the first of `ticks`, in either direction: one time per tick.
 /// So a motion model extrapolates to later times, and a scene that saw them what was true.
 pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> {
     if ticks.len() < 2 {
         return vec![start.clone()];
     }
-    let first = look(scene, ticks[0]);
+    let first = snapshot(scene, ticks[0]);
     let mut fast = moving(scene, ticks, &first, extent(&first).1).0;
     if !fast.contains(&true) {
         // Then all are static together.
@@ -128,9 +129,9 @@ pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> 
 pub fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[bool]) -> Vec<Moment> {
     let mut out = vec![start.clone()];
     let mut ties: Vec<Option<Tie>> = vec![None; start.len()];
-    let mut before = look(scene, ticks[0]);
+    let mut before = snapshot(scene, ticks[0]);
     for &t in &ticks[1..] {
-        let now = look(scene, t);
+        let now = snapshot(scene, t);
         let old = out.last().expect("it starts with one").clone();
         let moment = old.iter().zip(&mut ties).map(|(pose, tie)| {
             if tie.as_ref().is_none_or(|tie| tie.worn(&now)) {
@@ -144,7 +145,7 @@ pub fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[
     out
 }
 
-/// What carries a node: Gaussians as they were at a tick, and the node there.
+/// Carriers of a node: Gaussians at a tick, and the node there.
 #[derive(Clone)]
 struct Tie {
     pose: Pose,
@@ -210,7 +211,7 @@ impl Tie {
     }
 }
 
-/// The middle of the opaque Gaussians (medians), and within which distance of it most of them lie.
+/// The middle of the opaque Gaussians (medians), and the radius that contains most of them.
 fn extent(look: &Snapshot) -> ([f64; 3], f64) {
     let opaque: Vec<[f64; 3]> =
         (0..look.x.len()).filter(|&i| look.alpha[i] >= OPAQUE).map(|i| look.x[i].map(f64::from)).collect();
@@ -223,14 +224,13 @@ fn extent(look: &Snapshot) -> ([f64; 3], f64) {
 }
 
 /// Which Gaussians are fast while they are opaque, and which move: of those that are opaque finally the ones most of
-/// whose
-/// neighbours are fast. Of a body all move; what drifts or flickers does so alone.
+/// whose neighbours are fast. All Gaussians of a body move; drifting or flickering ones do so alone.
 fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec<bool>, Vec<bool>) {
     let n = last.x.len();
     let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; n];
     let mut seen = vec![0u32; n];
     for &t in ticks {
-        let now = look(scene, t);
+        let now = snapshot(scene, t);
         for i in (0..n).filter(|&i| now.alpha[i] >= OPAQUE) {
             seen[i] += 1;
             for c in 0..3 {
@@ -265,7 +265,7 @@ fn sociable(points: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
     points.into_iter().zip(square).filter(|(_, s)| *s <= most).map(|p| p.0).collect()
 }
 
-/// The centre of the points nearest to one: corners of dynamic regions are poor places to be carried at.
+/// The centre of the points nearest to one: corners of dynamic regions are poor positions to carry it by.
 fn centre(of: [f32; 3], points: &[[f32; 3]]) -> [f64; 3] {
     let square = |p: &[f32; 3]| (0..3).map(|c| f64::from(p[c] - of[c]).powi(2)).sum::<f64>();
     let mut order: Vec<(f64, usize)> = points.iter().enumerate().map(|(i, p)| (square(p), i)).collect();

@@ -11,7 +11,7 @@ const CLIP: f64 = 1.0;
 /// Decay of weights, of the rate.
 const DECAY: f64 = 1e-4;
 
-/// Weights, and what training knows of them.
+/// Weights and their training state.
 pub(crate) struct Optimiser<F> {
     moments: Moments<F>,
     grads: Grads<F>,
@@ -30,8 +30,8 @@ impl<F: Real> Optimiser<F> {
         Self { moments: Moments::new(p), grads: Grads::new(p), keys }
     }
 
-    /// One step along the gradient that `backward` adds; `done` of all steps have been taken. Returns whether it was finite:
-    /// a step that is not is left out.
+    /// One step along the gradient that `backward` adds; `done` of all steps have been taken. Returns whether it was
+    /// finite: a step that is not is left out.
     pub(crate) fn step(
         &mut self,
         p: &mut Params<F>,

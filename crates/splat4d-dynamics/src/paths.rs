@@ -7,7 +7,7 @@ use splat4d::math::se3::{add, mat_vec, norm, scale, sub};
 /// Below this angle (radians) the rotation vector is twice the quaternion's vector part, to 1e-13.
 const SMALL_ANGLE: f64 = 1e-6;
 
-/// Where a node is and how it has turned.
+/// Position and rotation of a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Position in the world, scene units.
@@ -17,7 +17,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Unturned, at a place.
+    /// Unturned, at a position.
     pub fn at(x: [f64; 3]) -> Self {
         Self { x, q: [1.0, 0.0, 0.0, 0.0] }
     }
@@ -26,7 +26,7 @@ impl Pose {
 /// All nodes at one time.
 pub type Moment = Vec<Pose>;
 
-/// Paths of nodes at even ticks, one a frame.
+/// Paths of nodes at even ticks, one per frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Paths {
     /// \[ticks]\[nodes]; every tick has as many nodes.
@@ -64,7 +64,7 @@ impl Paths {
         Self { moments: points.iter().map(|m| m.iter().map(|x| Pose::at(*x)).collect()).collect() }
     }
 
-    /// The same with rotations that follow from how neighbours lie, relative to the last tick.
+    /// The same with rotations derived from the positions of neighbours, relative to the last tick.
     pub fn turned_by_neighbours(mut self) -> Self {
         let rest = self.last().clone();
         let frames = Neighbours::new(&rest);
@@ -123,8 +123,8 @@ impl Neighbours {
         Self(nearest(rest, FRAME_NEIGHBOURS))
     }
 
-    /// Turns every node as its neighbours have moved about it since `rest`: the nearest rotation, and along what they leave
-    /// open as before.
+    /// Turns every node as its neighbours have moved about it since `rest`: the nearest rotation, and along what they
+    /// leave open as before.
     pub fn turn(&self, rest: &Moment, now: &mut Moment) {
         let before: Vec<[[f64; 3]; 3]> = now.iter().map(|p| quat::to_rotation(p.q)).collect();
         for (k, near) in self.0.iter().enumerate() {
@@ -156,7 +156,7 @@ pub fn nearest(of: &Moment, count: usize) -> Vec<Vec<usize>> {
         .collect()
 }
 
-/// Where a point goes that is fixed to a node: R (x − p) + p'.
+/// The position of a point fixed to a node: R (x − p) + p'.
 pub fn carried(x: [f64; 3], from: &Pose, to: &Pose) -> [f64; 3] {
     let turn = quat::to_rotation(quat::product(to.q, quat::conjugate(from.q)));
     add(mat_vec(&turn, sub(x, from.x)), to.x)

@@ -6,7 +6,7 @@ use splat4d::math::se3::{norm, sub};
 /// A forecast that leaves this multiple of the scene's size has diverged.
 const DIVERGED: f64 = 2.0;
 
-/// Mean distance of nodes from the truth, scene units, a number a frame as far as there is truth.
+/// Mean distance of nodes from the truth, scene units, a number per frame as far as there is truth.
 pub fn node_errors(found: &[Moment], truth: &[Moment]) -> Vec<f64> {
     let mean = |(a, b): (&Moment, &Moment)| {
         a.iter().zip(b).map(|(a, b)| norm(sub(a.x, b.x))).sum::<f64>() / a.len().max(1) as f64
@@ -14,8 +14,8 @@ pub fn node_errors(found: &[Moment], truth: &[Moment]) -> Vec<f64> {
     found.iter().zip(truth).map(mean).collect()
 }
 
-/// 1 − error/baseline of mean squared errors: 1 is perfect, 0 no better than the baseline, which is 0 exactly. Where the
-/// baseline makes no error, 0 for none and −∞ for any.
+/// 1 − error/baseline of mean squared errors: 1 is perfect, 0 no better than the baseline, which is 0 exactly. Where
+/// the baseline makes no error, 0 for none and −∞ for any.
 pub fn skill(error: f64, baseline: f64) -> f64 {
     if error == baseline { 0.0 } else { 1.0 - error / baseline }
 }
@@ -63,9 +63,9 @@ pub fn ensemble(members: &[Vec<Moment>]) -> (Vec<Moment>, Vec<Vec<f64>>) {
 /// How an ensemble's spread fits its errors.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Calibration {
-    /// Root mean square of the error over that of the spread: 1 is right, above is too sure of itself.
+    /// Root mean square of the error over that of the spread: 1 is right, above 1 is overconfident.
     pub ratio: f64,
-    /// Share of the nodes and frames whose error is at most the spread, and twice it.
+    /// Share of the nodes and frames whose error is at most the spread, and at most twice the spread.
     pub within: [f64; 2],
 }
 

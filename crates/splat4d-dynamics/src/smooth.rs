@@ -1,8 +1,9 @@
-//! Smoothing of observed paths: a cubic smoothing spline on even ticks, as strong as generalised cross-validation wants.
+//! Smoothing of observed paths: a cubic smoothing spline on even ticks, with the strength of generalised
+//! cross-validation.
 //!
-//! z = argmin ‖y − z‖² + λ‖D³z‖² (Whittaker 1923, Eilers 2003), whose ends stay free: parabolas pass unchanged, so that the
-//! velocity at the last observed time is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978) over
-//! all nodes together. No tick after the last observed one exists here.
+//! z = argmin ‖y − z‖² + λ‖D³z‖² (Whittaker 1923, Eilers 2003), whose ends stay free: parabolas pass unchanged, so that
+//! the velocity at the last observed time is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978)
+//! over all nodes together. No tick after the last observed one exists here.
 
 use crate::paths::{Moment, Paths};
 use nalgebra::DMatrix;
@@ -13,7 +14,7 @@ const ORDER: usize = 3;
 /// Strengths that are tried: 10^(i/2), from nothing that is seen to whole clips as parabolas.
 const STRENGTHS: std::ops::Range<i32> = -8..11;
 
-/// Smooth paths. Too few ticks for differences stay as they are.
+/// Smooth paths. With too few ticks for differences they are unchanged.
 pub(crate) fn smooth(paths: &Paths) -> Paths {
     let (ticks, nodes) = (paths.len(), paths.nodes());
     if ticks <= ORDER + 1 || nodes == 0 {

@@ -1,4 +1,4 @@
-//! Worlds with known physics, whose nodes and actions are known at every frame: what forecasts are measured by.
+//! Worlds with known physics, with ground-truth nodes and actions at every frame, for tests of forecasts.
 
 use crate::actions::Actions;
 use crate::paths::exp;
@@ -13,14 +13,14 @@ pub const FPS: f64 = 30.0;
 pub const FRAMES: usize = 150;
 /// Names of all worlds.
 pub const NAMES: [&str; 7] = ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth"];
-/// Scene units a second squared.
+/// Scene units per second squared.
 const GRAVITY: f64 = 9.81;
 /// Steps of integration a frame.
 const SUBSTEPS: usize = 40;
 /// Nodes along each side of the cloth.
 pub const CLOTH: usize = 9;
 
-/// What a body looks like, about its own origin.
+/// Shape and colour of a body, about its own origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// A ball of this radius.
@@ -34,7 +34,7 @@ pub enum Shape {
 /// A body and the nodes on it.
 #[derive(Clone, Debug)]
 pub struct Body {
-    /// Its look.
+    /// Its appearance.
     pub shape: Shape,
     /// Nodes, in the body's own axes; of cloth none.
     pub points: Vec<[f64; 3]>,
@@ -48,13 +48,13 @@ pub type Pose = ([f64; 3], [[f64; 3]; 3]);
 pub struct World {
     /// Its name.
     pub name: String,
-    /// What moves.
+    /// Moving bodies.
     pub bodies: Vec<Body>,
     /// \[frames]\[bodies].
     pub poses: Vec<Vec<Pose>>,
     /// \[frames]: nodes of the cloth, row by row; empty without one.
     pub cloth: Vec<Vec<[f64; 3]>>,
-    /// What is done to it.
+    /// Actions on it.
     pub actions: Option<Actions>,
 }
 
@@ -84,7 +84,7 @@ impl World {
         Ok(Self { name: name.into(), bodies, poses, cloth: Vec::new(), actions: None })
     }
 
-    /// True places of all nodes at a frame.
+    /// True positions of all nodes at a frame.
     pub fn nodes(&self, frame: usize) -> Vec<[f64; 3]> {
         let of =
             |(body, (x, r)): (&Body, &Pose)| body.points.iter().map(|p| add(*x, mat_vec(r, *p))).collect::<Vec<_>>();
@@ -204,7 +204,7 @@ fn bounce() -> (Vec<Body>, Poses) {
 fn rolling() -> (Vec<Body>, Poses) {
     const RADIUS: f64 = 0.4;
     const SPEED: f64 = 1.1;
-    const SLOWS: f64 = 0.18; // scene units a second squared
+    const SLOWS: f64 = 0.18; // scene units per second squared
     let pose = |t: usize| {
         let s = (t as f64 / FPS).min(SPEED / SLOWS);
         let way = SPEED * s - 0.5 * SLOWS * s * s;
@@ -304,7 +304,7 @@ mod tests {
             assert!(far < 4.5 && low > -0.05, "{name}: as far as {far}, as low as {low}");
             assert!(name == "cloth" || moved > 0.1, "{name} moves: {moved}");
         }
-        // The pendulum comes back to where it was let go: no energy is lost.
+        // The pendulum returns to its start: no energy is lost.
         let world = World::new("pendulum").unwrap();
         let height = |t: usize| world.poses[t][1].0[1];
         let top = (100..FRAMES).map(height).fold(0.0, f64::max);

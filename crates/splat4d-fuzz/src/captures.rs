@@ -80,7 +80,7 @@ const WIDTH: u32 = 8;
 const HEIGHT: u32 = 6;
 
 thread_local! {
-    /// A folder for each layout, made when it is first asked for.
+    /// A folder for each layout, made when it is first requested.
     static FOLDERS: RefCell<BTreeMap<&'static str, TempDir>> = const { RefCell::new(BTreeMap::new()) };
 }
 
@@ -371,7 +371,7 @@ fn tracks_npz() -> Vec<Vec<u8>> {
     [false, true].map(|deflate| zip(&[("tracks.npy", &tracks), ("visibility.npy", &seen)], deflate)).into()
 }
 
-/// Columns of 0 and of this value in turn.
+/// Alternating columns of 0 and of this value.
 fn grey(value: u8) -> Vec<u8> {
     encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| Luma([value * (x % 2) as u8])), ImageFormat::Png)
 }

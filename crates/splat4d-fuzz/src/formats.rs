@@ -58,7 +58,7 @@ const LEVELS: &str = r#"{"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.j
 /// A SOG scene of some Gaussians, made by splat-transform 3.7 of numbers of our own.
 const SOG: &[u8] = include_bytes!("../seeds/few.sog");
 
-/// Most pieces of a streamed scene that are put together: each is the whole seed.
+/// Most parts of a streamed scene that are put together: each is the whole seed.
 const PIECES: usize = 64;
 
 /// Opens a file of any kind and shows a time of it.
@@ -99,7 +99,7 @@ pub(crate) fn moving() -> Scene<f32> {
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, -1.0, 0.0], ..Scene::default() }
 }
 
-/// What the dialect with this ending writes, in every version.
+/// Output of the dialect with this ending, in every version.
 fn written(ending: &str) -> Vec<Vec<u8>> {
     let dialect = DIALECTS.iter().find(|d| d.ending == ending).expect("the ending is a dialect's");
     let scene = if dialect.moves { moving() } else { standing() };
@@ -190,7 +190,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     zip.finish().expect("memory takes all bytes")
 }
 
-/// What is inside the gzip streams of versions 2 and 3: damage reaches it past the checksum.
+/// Content of the gzip streams of versions 2 and 3: damage reaches it past the checksum.
 fn spz_bodies() -> Vec<Vec<u8>> {
     let inside = |file: Vec<u8>| {
         let mut body = Vec::new();
@@ -225,7 +225,7 @@ fn sog_meta(bytes: &[u8]) {
     drop(sog::read(&files));
 }
 
-/// Another index for pieces that are all the seed.
+/// Another index for parts that all equal the seed.
 fn sog_levels(bytes: &[u8]) {
     let Ok(finest) = levels::finest(bytes) else { return };
     let params = sog::unzip(SOG).and_then(|files| sog::read(&files)).expect("the seed is sound").0;
@@ -290,7 +290,7 @@ fn playback_seeds() -> Vec<Vec<u8>> {
     vec![include_bytes!("../../splat4d/tests/data/tiny.s4d").to_vec()]
 }
 
-/// Reads a playback file as it is, and with its checksums mended: almost every input would stop at these.
+/// Reads a playback file unchanged, and with its checksums corrected: almost every input would stop at these.
 fn playback_file(bytes: &[u8]) {
     let look = |bytes: &[u8]| {
         let _ = Index::needed(bytes);

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 pub(crate) const READERS: &[Reader] = &[Reader { name: "http", seeds, read: ask }];
 
-/// The longest that an answer to a few bytes takes.
+/// The longest that a response to a few bytes takes.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 fn seeds() -> Vec<Vec<u8>> {
@@ -32,7 +32,7 @@ fn server() -> &'static Running {
     })
 }
 
-/// Sends bytes and reads what comes back until the server closes, which it does once nothing more can come.
+/// Sends bytes and reads the response until the server closes, which it does once nothing more can come.
 fn ask(bytes: &[u8]) {
     let address = server().url().trim_start_matches("http://").trim_end_matches('/').to_owned();
     let mut stream = TcpStream::connect(address).expect("the server is there");

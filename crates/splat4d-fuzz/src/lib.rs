@@ -35,7 +35,7 @@ pub fn readers() -> impl Iterator<Item = &'static Reader> {
     READERS.iter().copied().flatten()
 }
 
-/// What a fuzz target calls. Panics: no reader has this name.
+/// Entry point of a fuzz target. Panics: no reader has this name.
 pub fn read(name: &str, bytes: &[u8]) {
     let reader = readers().find(|r| r.name == name).unwrap_or_else(|| panic!("there is no reader {name}"));
     (reader.read)(bytes);

@@ -12,18 +12,18 @@ use std::time::{Duration, Instant};
 const USAGE: &str = "\
 usage: fuzz [--minutes N | --seconds N] [--executions N] [--seed S] [--reader NAME]
   --minutes N      time for all readers together (default 2)
-  --executions N   at most so many inputs a reader
+  --executions N   at most this many inputs per reader
   --seed S         other inputs (default 1)
   --reader NAME    this reader alone";
 
-/// Address space of a process, kB: 1 GiB for the reader, and 128 MiB for the program, its seeds and its threads (16 to 20 MiB
-/// measured).
+/// Address space of a process, kB: 1 GiB for the reader, and 128 MiB for the program, its seeds and its threads (16 to
+/// 20 MiB measured).
 const MEMORY: u64 = (1 << 20) + (128 << 10);
 /// A reader that takes longer for one input hangs.
 const SLOWEST: Duration = Duration::from_secs(10);
 /// Ticks a second of the times in `/proc` (`USER_HZ`).
 const TICKS: f64 = 100.0;
-/// Inputs between two looks at the clock.
+/// Inputs between two readings of the clock.
 const BATCH: u64 = 64;
 
 #[derive(Clone, Debug)]
@@ -91,7 +91,8 @@ fn child(options: &Options) -> Result<()> {
             }
             let begun = Instant::now();
             (reader.read)(&input);
-            // A process that had to wait for a processor is not slow: what took long is read again by the processor's clock.
+            // A process that had to wait for a processor is not slow: slow inputs are read again by the processor's
+            // clock.
             if begun.elapsed() >= SLOWEST {
                 let (begun, before) = (Instant::now(), processor_time());
                 (reader.read)(&input);
@@ -107,7 +108,7 @@ fn child(options: &Options) -> Result<()> {
     Ok(())
 }
 
-/// What this process has used of processors; `None`: the system does not say.
+/// Processor time of this process; `None`: the system does not report it.
 fn processor_time() -> Option<Duration> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
     // Behind the name, which may hold spaces, the twelfth and thirteenth field: user and system (man 5 proc).
@@ -147,7 +148,7 @@ fn names() -> String {
     readers().map(|r| r.name).collect::<Vec<_>>().join(", ")
 }
 
-/// Runs a child: how many inputs it read, whether it ended well, and what it said.
+/// Runs a child: how many inputs it read, whether it succeeded, and its output.
 fn run(
     reader: &Reader,
     options: &Options,

@@ -4,7 +4,7 @@ use splat4d::math::Rng;
 
 /// Most changes of one input.
 const CHANGES: usize = 4;
-/// Half of the damage goes to the first bytes, where headers are.
+/// Half of the damage is in the first bytes, where headers are.
 const HEAD: usize = 256;
 /// Longest piece that is cut out or put in.
 const PIECE: usize = 64;

@@ -1,4 +1,5 @@
-//! Files of output folders: one of a sound run's files holds the bytes, and the run is opened. Runs come from other machines.
+//! Files of output folders: one of a valid run's files is replaced by the bytes, and the run is opened. Runs may be
+//! from other machines.
 
 use crate::Reader;
 use serde_json::json;

@@ -1,6 +1,6 @@
 //! Which reader covers each source file that opens files. A new one without an entry fails the test below.
 
-/// What covers a source file.
+/// Coverage of a source file.
 pub(crate) enum Covered {
     /// These readers.
     By(&'static [&'static str]),

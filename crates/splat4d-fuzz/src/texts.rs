@@ -1,6 +1,5 @@
-//! What people and programs give in addition to scenes and captures: recipes, edits, paths, points, actions,
-//! calibrations, requests of a
-//! page, videos.
+//! Inputs next to scenes and captures: recipes, edits, paths, points, actions, calibrations, requests of a page,
+//! videos.
 
 use crate::Reader;
 use splat4d::Error;
@@ -140,10 +139,10 @@ fn rigs() -> Vec<Vec<u8>> {
     ])
 }
 
-/// `compress.toml`, as it is written.
+/// `compress.toml`, as written.
 const ORDER: &str = "source = \"runs/a\"\nlevel = 1\nguard = 0.1\nasked = false\nunpruned = false\nfree = true\n\n[settings]\nprune = 0.2\nrounds = 1\n";
 
-/// `import.toml`, as it is written.
+/// `import.toml`, as written.
 const CORRECTIONS: &str = "version = 1\n[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";
 
 thread_local! {
@@ -185,7 +184,7 @@ fn requests() -> Vec<Vec<u8>> {
     .into()
 }
 
-/// What a page of `view --edit` sends.
+/// Requests of a page of `view --edit`.
 fn edit_request(bytes: &[u8]) {
     PAGE.with_borrow_mut(|page| {
         let list = FOLDER.with(|folder| folder.path().join("edits.toml"));

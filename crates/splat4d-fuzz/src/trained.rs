@@ -1,4 +1,4 @@
-//! What training and evaluation read: checkpoints with the state of the optimiser, LPIPS weights, true tracks.
+//! Inputs of training and evaluation: checkpoints with the state of the optimiser, LPIPS weights, true tracks.
 
 use crate::Reader;
 use crate::captures;
@@ -65,7 +65,7 @@ fn moving_checkpoints() -> Vec<Vec<u8>> {
     seeds(1)
 }
 
-/// A checkpoint as it is written, and one whose checksums no reader finds: almost every change would stop at these.
+/// A checkpoint as written, and one whose checksums no reader finds: almost every change would stop at these.
 fn seeds(number: usize) -> Vec<Vec<u8>> {
     let bytes = with_probe(number, |probe| probe.checkpoint()).unwrap_or_else(|e| panic!("{e}"));
     let mut open = bytes.clone();
@@ -75,7 +75,7 @@ fn seeds(number: usize) -> Vec<Vec<u8>> {
     vec![open, bytes]
 }
 
-/// Shapes of AlexNet's tensors, as `docs/metrics.md` wants them.
+/// Shapes of AlexNet's tensors, as in `docs/metrics.md`.
 fn alexnet() -> Vec<(String, Vec<usize>)> {
     let convolutions: [(usize, [usize; 4]); 5] = [
         (0, [64, 3, 11, 11]),
@@ -103,7 +103,7 @@ fn lpips_headers() -> Vec<Vec<u8>> {
     vec![serde_json::Value::Object(header).to_string().into_bytes()]
 }
 
-/// Room for a header before the numbers, which are made once.
+/// Space for a header before the numbers, which are made once.
 const HEADER: usize = 1 << 14;
 
 /// Calls `f` with the file that begins with this header.

@@ -4,7 +4,7 @@ use flate2::Compression;
 use flate2::write::DeflateEncoder;
 use std::io::Write;
 
-/// A zip of these files (APPNOTE 4.3), stored or deflated; its checksums are 0, which no reader looks at.
+/// A zip of these files (APPNOTE 4.3), stored or deflated; its checksums are 0, which no reader checks.
 pub(crate) fn zip(files: &[(&str, &[u8])], deflate: bool) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, plain) in files {

@@ -11,7 +11,7 @@ use std::path::Path;
 pub const FILE: &str = "import.toml";
 /// The version of the file.
 const VERSION: u32 = 1;
-/// What stands above.
+/// The text above.
 const HEAD: &str =
     "# What `import` found for every camera. Correct it and run the same command again: `import` continues
 # from here.
@@ -38,7 +38,7 @@ pub struct Corrections {
     pub cameras: Vec<Camera>,
 }
 
-/// What is known of a camera.
+/// Known values of a camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {
@@ -59,7 +59,7 @@ pub struct Camera {
     /// Standard deviation of the offset, seconds: to read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sigma: Option<f64>,
-    /// What the offset is from: to read.
+    /// Source of the offset, for readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub by: Vec<String>,
     /// Whether other evidence would have contradicted a wrong offset: to read.
@@ -133,13 +133,13 @@ impl Camera {
         if self.keep_lens {
             return;
         }
-        // Zeros at the end say nothing.
+        // Zeros at the end carry no information.
         let short = |values: &[f64]| values[..values.iter().rposition(|v| *v != 0.0).map_or(0, |i| i + 1)].to_vec();
         let (k, p, fisheye) = match lens {
             Lens::Brown { k, p, .. } => (short(k), short(p), false),
             Lens::Fisheye { k } => (short(k), Vec::new(), true),
             Lens::Pinhole => (Vec::new(), Vec::new(), false),
-            // Only a calibration has others, which stands in its own file.
+            // Only a calibration has others, which is in its own file.
             _ => return,
         };
         let Intrinsics { fx, fy, cx, cy } = *intrinsics;
@@ -208,8 +208,8 @@ impl Intrinsic {
 }
 
 impl Corrections {
-    /// The file in a capture's folder; that of cameras of which nothing is known where there is none. Cameras that it does
-    /// not name are added, in the order of `names`.
+    /// The file in a capture's folder; that of cameras of which nothing is known where there is none. Cameras that it
+    /// does not name are added, in the order of `names`.
     ///
     /// Errors: no TOML, unknown keys, numbers that are none, cameras that there are not.
     pub fn read(folder: &Path, names: &[String]) -> Result<Self> {
@@ -256,7 +256,7 @@ impl Corrections {
         write_atomically(&folder.join(FILE), format!("{HEAD}{body}").as_bytes())
     }
 
-    /// What the user gives of all cameras' offsets.
+    /// Offsets of all cameras given by the user.
     pub fn given_offsets(&self) -> Vec<Option<f64>> {
         self.cameras.iter().map(Camera::given_offset).collect()
     }
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_found_is_written_and_what_was_corrected_is_kept() {
+    fn results_are_written_and_corrections_are_kept() {
         let folder = tempfile::tempdir().unwrap();
         let mut file = Corrections::read(folder.path(), &names()).unwrap();
         assert_eq!(file.given_offsets(), [None, None]);

@@ -1,5 +1,5 @@
-//! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …, `poses_bounds.npy`).
-//! Frames are extracted once, below the capture, where its reader searches for them.
+//! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …,
+//! `poses_bounds.npy`). Frames are extracted once, below the capture, where its reader searches for them.
 
 use crate::video::{self, Info, Selection, Source};
 use crate::write::{self, Clip, Format};
@@ -19,7 +19,7 @@ const SIDE: usize = 1080;
 /// Folder of the notes that `write::pictures` keeps of what it stored.
 const NOTES: &str = "import";
 
-/// What was extracted.
+/// The extracted frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Extracted {
     /// Cameras.
@@ -28,7 +28,7 @@ pub struct Extracted {
     pub frames: usize,
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// What was odd, a sentence or two each.
+    /// Remarks, a sentence or two each.
     pub warnings: Vec<String>,
 }
 
@@ -59,10 +59,11 @@ fn stem(video: &Path) -> String {
     video.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Extracts the frames of such a capture into its folder `images/`; what is there already is left, and work that was
-/// interrupted goes on. `None`: it is no such capture. `stop` is asked after every few frames.
+/// Extracts the frames of such a capture into its folder `images/`; existing files are kept, and work that was
+/// interrupted continues. `None`: not such a capture. `stop` is called after every few frames.
 ///
-/// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+/// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` if `stop` requested
+/// it.
 pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Option<Extracted>> {
     let videos = videos(root);
     if videos.is_empty() {
@@ -84,7 +85,7 @@ pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool
     let pictures = write::pictures(root, &clips, Format::default(), progress, stop).map_err(|e| match e.kind() {
         ErrorKind::Interrupted => e,
         _ => e.remedy(
-            "Frames are stored in the folder `images` of the capture: copy it to a disk with room where you may write.",
+            "Frames are stored in the folder `images` of the capture: copy it to a disk with space where you may write.",
         ),
     })?;
     let mut warnings: Vec<String> = Vec::new();
@@ -151,7 +152,7 @@ fn frames_of(info: &Info) -> Option<usize> {
     info.frames.or_else(|| Some((info.duration? * info.average_rate.or(info.nominal_rate)?).round() as usize))
 }
 
-/// What such a capture holds before its frames are extracted.
+/// Content of such a capture before extraction.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Contents {
     /// Names of the cameras, and frames of each, where its file states them.
@@ -164,7 +165,7 @@ pub struct Contents {
     pub rate: Option<f64>,
     /// Seconds of the longest, where files state them.
     pub seconds: Option<f64>,
-    /// What is odd, a sentence or two each; those that spoil the result first.
+    /// Remarks, a sentence or two each; those that spoil the result first.
     pub warnings: Vec<String>,
 }
 
@@ -175,7 +176,8 @@ fn is_extracted(root: &Path, video: &Path) -> bool {
     note.is_some_and(|n| n["complete"] == true)
 }
 
-/// What such a capture holds; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but of space.
+/// Content of such a capture; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but
+/// of space.
 pub fn contents(root: &Path) -> Result<Option<Contents>> {
     let videos = videos(root);
     if videos.iter().all(|v| is_extracted(root, v)) {

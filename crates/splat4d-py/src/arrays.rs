@@ -18,7 +18,7 @@ pub(crate) fn shaped<T: numpy::Element>(py: Python<'_>, numbers: Vec<T>, shape: 
     Ok(flat.reshape(shape.to_vec())?.into_any().unbind())
 }
 
-/// Planes [c, h, w] as an image [h, w, c] that looks at the same memory.
+/// Planes [c, h, w] as an image [h, w, c] that shares the memory.
 pub(crate) fn picture(py: Python<'_>, planes: Planes<f32>) -> PyResult<Bound<'_, PyAny>> {
     let shape = [planes.channels, planes.height, planes.width];
     let array: Bound<'_, PyArray3<f32>> = planes.data.into_pyarray(py).reshape(shape)?;
@@ -30,7 +30,8 @@ pub(crate) fn plane(py: Python<'_>, planes: Planes<f32>) -> PyResult<Py<PyAny>> 
     shaped(py, planes.data, &[planes.height, planes.width])
 }
 
-/// Anything that NumPy makes an array of, as numbers of type T; a copy only where it must be. `what` names it in errors.
+/// Anything that NumPy makes an array of, as numbers of type T; a copy only where it must be. `what` names it in
+/// errors.
 pub(crate) fn numbers<'py, T: numpy::Element>(
     value: &Bound<'py, PyAny>,
     what: &str,
@@ -70,7 +71,7 @@ pub(crate) fn finite<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> Py
     }
 }
 
-/// What the numbers of an image are.
+/// Type of an image's numbers.
 pub(crate) enum Kind {
     /// From 0 to 255.
     Bytes,
@@ -81,7 +82,7 @@ pub(crate) enum Kind {
 /// Anything that NumPy makes an array of, in its own type of numbers, if images may have that one.
 pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bound<'py, PyAny>, Kind)> {
     let array = value.py().import("numpy")?.call_method1("asarray", (value,)).map_err(|e| {
-        bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give an image [height, width, 3]")
+        bad_input(format!("{what} is not an array ({})", e.value(value.py())), "Give an image [height, width, 3]")
     })?;
     let dtype = array.getattr("dtype")?;
     let kind: (String, usize) = (dtype.getattr("kind")?.extract()?, dtype.getattr("itemsize")?.extract()?);

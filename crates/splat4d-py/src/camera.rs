@@ -1,4 +1,4 @@
-//! Cameras as Python has them.
+//! Python's camera class.
 
 use crate::arrays::{finite, numbers, shaped};
 use crate::errors::{OrRaise, bad_input};

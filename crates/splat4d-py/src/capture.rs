@@ -14,7 +14,7 @@ use splat4d_train::run::open_capture;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Memory for decoded images that were asked for lately.
+/// Memory for decoded images that were requested lately.
 const STORE_BYTES: usize = 64 << 20;
 
 /// Images with poses and times, in any layout that `splat4d info` reads.
@@ -30,7 +30,7 @@ pub(crate) struct Capture {
     _temporary: Option<Temporary>,
 }
 
-/// A temporary folder (Python's), removed with what is in it when this goes.
+/// A temporary folder (Python's), removed with its content when this is dropped.
 pub(crate) struct Temporary(Py<PyAny>);
 
 impl Drop for Temporary {

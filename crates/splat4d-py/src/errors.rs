@@ -1,4 +1,4 @@
-//! Errors as exceptions: one class, the same text, and the class of trouble as `kind`.
+//! Errors as exceptions: one class, the same text, and the class of error as `kind`.
 
 use pyo3::create_exception;
 use pyo3::exceptions::PyException;
@@ -12,7 +12,7 @@ create_exception!(
     "What went wrong, where, and what to do. `kind`: bad_input, io, unsupported, memory, diverged, interrupted or failed."
 );
 
-/// Results of the libraries as Python has them.
+/// Results of the libraries converted for Python.
 pub(crate) trait OrRaise<T> {
     fn or_raise(self) -> PyResult<T>;
 }
@@ -32,7 +32,7 @@ impl<T> OrRaise<T> for anyhow::Result<T> {
     }
 }
 
-/// An exception for what the caller handed over: what of it is wrong, and what to do.
+/// An exception for an invalid argument: what is wrong, and what to do.
 pub(crate) fn bad_input(what: impl Into<String>, remedy: &str) -> PyErr {
     let error = splat4d::Error::input(what).remedy(remedy);
     exception(&error.to_string(), Some(error.kind()))
@@ -56,7 +56,7 @@ fn exception(text: &str, kind: Option<ErrorKind>) -> PyErr {
     })
 }
 
-/// Says these as Python warnings.
+/// Emits these as Python warnings.
 pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
     let category = py.get_type::<pyo3::exceptions::PyUserWarning>();
     messages.iter().try_for_each(|message| {
@@ -65,7 +65,7 @@ pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
     })
 }
 
-/// Words of the command in remedies, and what says the same in Python.
+/// Words of the command in remedies, and their equivalents in Python.
 const WORDS: [(&str, &str); 5] = [
     ("`train --resume`", "splat4d.resume"),
     (RESUME, "splat4d.resume"),
@@ -74,7 +74,7 @@ const WORDS: [(&str, &str); 5] = [
     ("--motion ", "motion="),
 ];
 
-/// The error of training as an exception that speaks of Python's arguments.
+/// The error of training as an exception in terms of Python's arguments.
 pub(crate) fn in_python(error: &splat4d::Error) -> PyErr {
     exception(&python_words(&error.to_string()), Some(error.kind()))
 }

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// Steps of a float image in its file: 16 bits a sample, whose rounding is far below a camera's resolution.
 const LEVELS: f32 = 65535.0;
 
-/// What the caller gave.
+/// Arguments of the caller.
 pub(crate) struct Arrays<'a, 'py> {
     pub(crate) images: &'a Bound<'py, PyAny>,
     pub(crate) cameras: &'a Bound<'py, PyAny>,
@@ -35,15 +35,15 @@ struct Samples {
     kind: ExtendedColorType,
 }
 
-/// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a folder
-/// that holds a capture already.
+/// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a
+/// folder that holds a capture already.
 pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> PyResult<()> {
     let mut written = Vec::new();
     let done = write_all(py, arrays, folder, &mut written);
     if done.is_err() {
         for path in &written {
             let _ = std::fs::remove_file(path);
-            // Folders go when they are empty; those of the user are not.
+            // Folders are removed when empty; those of the user are not empty.
             path.ancestors().skip(1).take_while(|f| *f != folder).for_each(|f| drop(std::fs::remove_dir(f)));
         }
     }
@@ -111,7 +111,7 @@ struct Filmed<'a, 'py> {
 }
 
 impl Filmed<'_, '_> {
-    /// Its places: one, or one a frame.
+    /// Its positions: one, or one per frame.
     fn views(&self) -> PyResult<Vec<Camera>> {
         if let Ok(fixed) = self.cameras.extract::<Camera>() {
             return Ok(vec![fixed]);
@@ -171,7 +171,7 @@ impl Filmed<'_, '_> {
 fn items<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<Vec<Bound<'py, PyAny>>> {
     let all = value.try_iter().and_then(|all| all.collect::<PyResult<Vec<_>>>());
     all.map_err(|e| {
-        bad_input(format!("{what} cannot be gone through ({e})"), "Give a list, or an array with one axis more")
+        bad_input(format!("{what} cannot be iterated ({e})"), "Give a list, or an array with one axis more")
     })
 }
 
@@ -236,7 +236,7 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
         }
     };
     if !image.hasattr("__array__")? {
-        return Err(bad_input(format!("{what} is no array"), "Give NumPy arrays"));
+        return Err(bad_input(format!("{what} is not an array"), "Give NumPy arrays"));
     }
     let (image, kind) = pixels(image, what)?;
     match kind {

@@ -29,7 +29,7 @@ pub(crate) struct Gaussians {
     #[pyo3(get)]
     opacities: Py<PyAny>,
     count: usize,
-    /// Where spherical harmonics are gathered from; none: they were given.
+    /// Source of spherical harmonics; none: they were given.
     seen: Option<(Arc<Source>, Evaluation)>,
     sh: PyOnceLock<Py<PyAny>>,
 }
@@ -65,9 +65,9 @@ impl Gaussians {
 
 #[pymethods]
 impl Gaussians {
-    /// Gaussians of your own: `means` [N, 3], `quats` [N, 4] (wxyz, of any length), `scales` [N, 3] and `opacities` [N] from 0
-    /// to 1 (standard deviations and opacities themselves, not logarithms and logits), and either `sh` [N, K, 3] with K 1, 4,
-    /// 9 or 16, or `colors` [N, 3] from 0 to 1.
+    /// Gaussians of your own: `means` [N, 3], `quats` [N, 4] (wxyz, of any length), `scales` [N, 3] and `opacities` [N]
+    /// from 0 to 1 (standard deviations and opacities themselves, not logarithms and logits), and either `sh` [N, K, 3]
+    /// with K 1, 4, 9 or 16, or `colors` [N, 3] from 0 to 1.
     #[new]
     #[pyo3(signature = (means, quats, scales, opacities, *, sh=None, colors=None, time=0.0))]
     #[allow(clippy::too_many_arguments)]
@@ -105,7 +105,7 @@ impl Gaussians {
     #[getter]
     fn sh(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let made = self.sh.get_or_try_init(py, || {
-            let (source, seen) = self.seen.as_ref().expect("who was given colours has them");
+            let (source, seen) = self.seen.as_ref().expect("colours that were given are stored");
             let (sh, k) = py.detach(|| layers::Gaussians::sh(&source.scene, seen));
             shaped(py, sh, &[self.count, k, 3])
         })?;

@@ -6,13 +6,13 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use splat4d::scene::Planes;
 use splat4d_train::loss::Photometric;
-use splat4d_train::loss::image::{self, ImageTerm, Needs, PictureGrads, Shown};
+use splat4d_train::loss::image::{self, ImageTerm, LossGrads, Needs, Shown};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::run::OwnLoss;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Where a run's Python functions leave what they raised, and say stop. The first exception counts.
+/// Exceptions of a run's Python functions, and its stop flag. The first exception counts.
 #[derive(Default)]
 pub(crate) struct Raised {
     pub(crate) stop: AtomicBool,
@@ -43,7 +43,7 @@ pub(crate) struct View {
     iteration: usize,
 }
 
-/// The term that asks the function.
+/// The term that calls the function.
 struct RunRequest {
     function: Py<PyAny>,
     raised: Arc<Raised>,
@@ -63,7 +63,7 @@ impl ImageTerm for RunRequest {
         Needs::default()
     }
 
-    fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let seen = View { time: view.t.0, frame: view.frame, camera: view.rig, iteration: info.iteration };
         let answer = Python::attach(|py| self.request(py, seen, shown.color, view.truth, d.color.add()));
         answer.unwrap_or_else(|error| {
@@ -84,7 +84,7 @@ impl RunRequest {
         truth: &Planes<f32>,
         d: &mut Planes<f32>,
     ) -> PyResult<f64> {
-        // Copies: Python may keep what it is given.
+        // Copies, because Python may keep its arguments.
         let answer = self.function.call1(py, (picture(py, shown.clone())?, picture(py, truth.clone())?, view))?;
         let wrong = "the loss did not return a value and a gradient";
         let remedy = "Return (float, array [h, w, 3])";

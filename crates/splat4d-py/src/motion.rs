@@ -1,4 +1,4 @@
-//! Motion models written in Python (`splat4d.Motion`): the library asks one for the Gaussians at a time, and hands it the
+//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes it the
 //! gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
 //! checkpoints and scenes hold them.
 
@@ -33,16 +33,16 @@ const TAKEN: [&str; 13] = [
     "features",
     "labels",
 ];
-/// Bytes that a question leaves for its backward, a Gaussian: raw and activated rows here and in Python.
+/// Bytes that a query leaves for its backward, a Gaussian: raw and activated rows here and in Python.
 const SCRATCH: u64 = 256;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
 
-/// The Python object, and what it says of itself.
+/// The Python object, and what it states about itself.
 pub(crate) struct Hook {
     object: Py<PyAny>,
     name: String,
-    /// Tables with a row a Gaussian: name and width.
+    /// Tables with a row per Gaussian: name and width.
     per_gaussian: Vec<(&'static str, usize)>,
     /// Arrays that all Gaussians share: name, shape, first values.
     shared: Vec<(String, Vec<usize>, Vec<f32>)>,
@@ -51,7 +51,7 @@ pub(crate) struct Hook {
 }
 
 impl Hook {
-    /// Makes the model of a `splat4d.Motion` known by its name. Errors: what it says of itself is not as it should be.
+    /// Makes the model of a `splat4d.Motion` known by its name. Errors: its declaration is invalid.
     pub(crate) fn register(motion: &Bound<'_, PyAny>) -> PyResult<Arc<Self>> {
         let get = |name: &str| {
             motion.getattr(name).map_err(|_| bad_input(format!("the motion has no `{name}`"), "Give a splat4d.Motion"))
@@ -134,13 +134,13 @@ struct PyMotion {
     hook: Arc<Hook>,
     per_gaussian: Vec<Key>,
     shared: Vec<Key>,
-    /// The canonical Gaussians are all there is, and Python is not asked.
+    /// There are only the canonical Gaussians, and Python is not called.
     rests: bool,
 }
 
-/// What an answer leaves for its backward.
+/// State of a result for its backward.
 #[derive(Default)]
-struct Answer {
+struct ResultState {
     tape: Option<Py<PyAny>>,
     /// Mean, quaternion, log scales and opacity logit of every splat, as Python gave them.
     raw: Vec<[f32; 11]>,
@@ -163,7 +163,7 @@ impl PyMotion {
         self.hook.colors && !self.rests
     }
 
-    /// The arguments of a question: raw parameters of the asked rows, and the shared arrays.
+    /// The arguments of a query: raw parameters of the requested rows, and the shared arrays.
     fn arguments<'py>(&self, py: Python<'py>, q: &At<'_>) -> PyResult<Bound<'py, PyDict>> {
         let (n, geometry) = (q.len(), &q.p[GEOMETRY]);
         let ids = || (0..n).map(|j| q.rows.id(j));
@@ -188,11 +188,11 @@ impl PyMotion {
         Ok(out)
     }
 
-    /// Asks Python for the Gaussians at a time.
-    fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
+    /// Calls Python for the Gaussians at a time.
+    fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<ResultState> {
         let n = q.len();
         let answer = self.hook.object.bind(py).call_method1("forward", (self.arguments(py, q)?, q.t.0))?;
-        let wrong = || bad_input("the motion's forward did not return six things", "Return a splat4d.Motion's forward");
+        let wrong = || bad_input("the motion's forward did not return six arrays", "Return a splat4d.Motion's forward");
         let answer: [Bound<'_, PyAny>; 6] = answer.extract().map_err(|_| wrong())?;
         let [means, quats, scales, opacities, colors, tape] = &answer;
         let read = |value: &Bound<'_, PyAny>, what: &str, width: usize| -> PyResult<Vec<f32>> {
@@ -236,15 +236,15 @@ impl PyMotion {
             table = Table::new(&[("color", 3)], n);
             (0..n).for_each(|j| table.write(j, 0, [given[3 * j], given[3 * j + 1], given[3 * j + 2]]));
         }
-        Ok(Answer { tape: Some(tape.clone().unbind()), raw, colors: table })
+        Ok(ResultState { tape: Some(tape.clone().unbind()), raw, colors: table })
     }
 
-    /// Hands Python the gradient to an answer, and adds what comes back to the tables'. Returns dL/dt.
+    /// Passes Python the gradient to a result, and adds the returned gradients to the tables'. Returns dL/dt.
     fn hand_back(
         &self,
         py: Python<'_>,
         q: &At<'_>,
-        answer: &Answer,
+        answer: &ResultState,
         d_out: &SplatGrads<'_>,
         d: &mut Grads,
     ) -> PyResult<f64> {
@@ -296,7 +296,7 @@ impl PyMotion {
             }
             let unknown = || {
                 bad_input(
-                    format!("the motion's backward returned `{name}`, which is no array of it"),
+                    format!("the motion's backward returned `{name}`, which is not one of its arrays"),
                     "Return the names that forward is given",
                 )
             };
@@ -349,7 +349,7 @@ impl Motion for PyMotion {
             if self.colors() {
                 colors = Table::new(&[("color", 3)], q.len());
             }
-            Answer { tape: None, raw: (0..q.len()).map(raw).collect(), colors }
+            ResultState { tape: None, raw: (0..q.len()).map(raw).collect(), colors }
         });
         tape.start(q.len());
         answer.raw.iter().enumerate().for_each(|(j, raw)| tape.out.write(j, 0, activate(*raw)));
@@ -357,7 +357,7 @@ impl Motion for PyMotion {
     }
 
     fn color<'a>(&self, q: &At<'a>, tape: &'a Tape) -> Color<'a> {
-        match tape.own.get::<Answer>() {
+        match tape.own.get::<ResultState>() {
             Some(answer) if self.colors() && !q.is_empty() => Color::Direct { table: &answer.colors },
             _ => Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true },
         }
@@ -375,9 +375,9 @@ impl Motion for PyMotion {
         if self.rests || q.is_empty() {
             return Still.backward(q, cache, tape, d_out, d_cache, d);
         }
-        let answer = std::mem::take(tape.own.get_or_default::<Answer>());
+        let answer = std::mem::take(tape.own.get_or_default::<ResultState>());
         if answer.tape.is_none() {
-            return 0.0; // what it could not answer has no gradient; the error is on its way
+            return 0.0; // a failed query has no gradient; the error is raised later
         }
         Python::attach(|py| self.hand_back(py, q, &answer, d_out, d)).unwrap_or_else(|error| {
             self.hook.raised.raise(error);
@@ -395,7 +395,7 @@ impl Motion for PyMotion {
     }
 }
 
-/// Raises what a motion of the scene has raised while it was asked.
+/// Raises the exception that a motion of the scene has raised.
 pub(crate) fn raise(scene: &splat4d::layers::Scene<f32>) -> PyResult<()> {
     for layer in &scene.layers {
         let motion: &dyn std::any::Any = &*layer.motion;

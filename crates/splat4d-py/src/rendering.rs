@@ -50,7 +50,8 @@ pub(crate) fn parameters<'py>(py: Python<'py>, scene: &Scene<f32>) -> PyResult<B
     Ok(out)
 }
 
-/// The scene with some of its arrays replaced. Errors: a name or a shape that it does not have, numbers that are not finite.
+/// The scene with some of its arrays replaced. Errors: a name or a shape that it does not have, numbers that are not
+/// finite.
 pub(crate) fn with_parameters(scene: &Scene<f32>, new: &Bound<'_, PyDict>) -> PyResult<Scene<f32>> {
     let names = named(scene);
     let mut out = scene.clone();
@@ -80,8 +81,8 @@ pub(crate) fn with_parameters(scene: &Scene<f32>, new: &Bound<'_, PyDict>) -> Py
     Ok(out)
 }
 
-/// A render that remembers how it came about, so that a gradient to its image becomes gradients to the scene's
-/// parameters, the camera and the time.
+/// A render that stores its inputs, so that a gradient to its image becomes gradients to the scene's parameters, the
+/// camera and the time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Rendering {
     scene: Arc<Scene<f32>>,
@@ -94,8 +95,8 @@ pub(crate) struct Rendering {
     /// [h, w] float32, from 0 to 1.
     #[pyo3(get)]
     alpha: Py<PyAny>,
-    /// [h, w] float32: Σ z α T, depth along the camera's z in scene units times what each Gaussian contributes; divide it by
-    /// `alpha` for expected depth.
+    /// [h, w] float32: Σ z α T, depth along the camera's z in scene units times what each Gaussian contributes; divide
+    /// it by `alpha` for expected depth.
     #[pyo3(get)]
     depth: Py<PyAny>,
     state: Mutex<(Renderer, Evaluation)>,
@@ -154,11 +155,10 @@ fn gradient(value: &Bound<'_, PyAny>, what: &str, channels: usize, camera: &Came
 
 #[pymethods]
 impl Rendering {
-    /// Gradients of a scalar L, given dL/d`color` [h, w, 3] and, where L depends on them, dL/d`alpha` and dL/d`depth` [h, w]:
-    /// a dict of arrays with the names and shapes of `Scene.parameters()`, and next to them `time` (dL/dt, a float;
-    /// 0 before
-    /// and after a Gaussian's path), `camera` ([6]: a translation and a rotation of the camera's axes, applied from the left
-    /// to `world_to_camera`) and `background` ([3]).
+    /// Gradients of a scalar L, given dL/d`color` [h, w, 3] and, where L depends on them, dL/d`alpha` and dL/d`depth`
+    /// [h, w]: a dict of arrays with the names and shapes of `Scene.parameters()`, and next to them `time` (dL/dt, a
+    /// float; 0 before and after a Gaussian's path), `camera` ([6]: a translation and a rotation of the camera's axes,
+    /// applied from the left to `world_to_camera`) and `background` ([3]).
     #[pyo3(signature = (color=None, alpha=None, depth=None))]
     fn backward<'py>(
         &self,
@@ -186,7 +186,7 @@ impl Rendering {
                 let mut d_sh = sh_grads(&splats, &mut grads);
                 renderer.backward(&shot, &pixels, &mut d_sh, &mut d);
             }
-            // The same answers take another gradient when this is called again.
+            // Another call backpropagates another gradient through the same results.
             scene.at(self.time, seen);
             seen.activate(&mut grads);
             d.add_to(scene, self.time, seen, &mut grads);

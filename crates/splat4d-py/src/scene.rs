@@ -14,7 +14,7 @@ use splat4d::bake::{Options, TOLERANCE};
 use splat4d::device;
 use splat4d::flow::tracks;
 use splat4d::layers::{Evaluation, Head};
-use splat4d::render::{Image, RenderConfig, Shot, Tables, Wanted};
+use splat4d::render::{Abilities, Image, RenderConfig, Shot, Tables};
 use splat4d::scene::{Planes, Time};
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::converting::{self, Conversion};
@@ -31,13 +31,13 @@ use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Alpha below which a pixel has no depth (the faintest splat that is drawn).
+/// Alpha below which a pixel has no depth (the faintest splat that is rendered).
 const DEPTH_ALPHA: f32 = 1.0 / 255.0;
 
 /// A scene in space and time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Scene {
-    /// Where it was opened; none: it was made here.
+    /// Path of an opened scene; none: it was made here.
     path: Option<PathBuf>,
     source: Arc<Source>,
     views: Vec<View>,
@@ -46,8 +46,8 @@ pub(crate) struct Scene {
 /// Name of the file that a scene without one is written to, in a folder of its own, for the commands that read files.
 const SCENE: &str = "scene.safetensors";
 
-/// Opens a run folder, a playback file, a scene file, or a file or folder of another program's Gaussians. A scene that was
-/// trained with a `Motion` of your own needs it again.
+/// Opens a run folder, a playback file, a scene file, or a file or folder of another program's Gaussians. A scene that
+/// was trained with a `Motion` of your own needs it again.
 #[pyfunction]
 #[pyo3(signature = (path, *, motion=None))]
 pub(crate) fn open(py: Python<'_>, path: PathBuf, motion: Option<&Bound<'_, PyAny>>) -> PyResult<Scene> {
@@ -133,12 +133,12 @@ fn time(t: f64) -> PyResult<Time> {
 impl Scene {
     /// A scene of Gaussians of your own, given as `Gaussians(...)` takes them.
     ///
-    /// Static: [N, ...] each. With a pose for each of several times: `means` [T, N, 3], `quats` [T, N, 4] or both, at `times`
-    /// [T] seconds [k/fps]; between them positions and rotations are interpolated. With kinematics: `velocities` [N, 3], or
-    /// [N, P, 3] for the first P powers of time (P at most 3, scene units / s^p), and `rotation_rates` [N, 4] (1/s, added to
-    /// `quats`), both around `centers` [N] seconds, or around second 0 where there are none; with `durations` [N] seconds the
-    /// opacity is multiplied by exp(−½((t − center)/duration)²). `clip`: first and last second; `up` [0, 1, 0]; `background`
-    /// [black].
+    /// Static: [N, ...] each. With a pose for each of several times: `means` [T, N, 3], `quats` [T, N, 4] or both, at
+    /// `times` [T] seconds [k/fps]; between them positions and rotations are interpolated. With kinematics:
+    /// `velocities` [N, 3], or [N, P, 3] for the first P powers of time (P at most 3, scene units / s^p), and
+    /// `rotation_rates` [N, 4] (1/s, added to `quats`), both around `centers` [N] seconds, or around second 0 where
+    /// there are none; with `durations` [N] seconds the opacity is multiplied by exp(−½((t − center)/duration)²).
+    /// `clip`: first and last second; `up` [0, 1, 0]; `background` [black].
     #[staticmethod]
     #[pyo3(signature = (
         means, quats, scales, opacities, *, sh=None, colors=None, times=None, velocities=None, rotation_rates=None,
@@ -170,7 +170,8 @@ impl Scene {
         Ok(Self::made(about.scene(vec![layer], seen)?, Vec::new()))
     }
 
-    /// A scene of frames that have nothing to do with each other, each a `Gaussians`: frame k is seen around k/fps seconds.
+    /// A scene of frames that have nothing to do with each other, each a `Gaussians`: frame k is seen around k/fps
+    /// seconds.
     #[staticmethod]
     #[pyo3(signature = (frames, *, fps=30.0, up=None, background=None))]
     fn from_frames(
@@ -189,8 +190,8 @@ impl Scene {
     }
 
     /// All learnable arrays of the scene by their names in `scene.safetensors`: `layers.0.means` [N, 3],
-    /// `layers.0.log_scales` [N, 3], `layers.0.opacity_logits` [N], `layers.0.sh` [N, K, 3], … and those of its motion model.
-    /// Copies. Not of a playback file, which has none.
+    /// `layers.0.log_scales` [N, 3], `layers.0.opacity_logits` [N], `layers.0.sh` [N, K, 3], … and those of its motion
+    /// model. Copies. Not of a playback file, which has none.
     fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         rendering::parameters(py, learnable(self)?)
     }
@@ -261,8 +262,9 @@ impl Scene {
     /// (of a run). float32, NaN where empty. `device`: `cpu`, `gpu` or `auto`, for colour, alpha and depth; the CPU
     /// renders the others.
     ///
-    /// With `requires_grad`, renders colour, alpha and depth on the CPU and returns a `Rendering`, whose `backward(d_color)`
-    /// takes the gradient of any function of the image to the scene's `parameters()`, the camera and the time.
+    /// With `requires_grad`, renders colour, alpha and depth on the CPU and returns a `Rendering`, whose
+    /// `backward(d_color)` takes the gradient of any function of the image to the scene's `parameters()`, the camera
+    /// and the time.
     #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu", requires_grad=false))]
     #[allow(clippy::too_many_arguments)]
     fn render<'py>(
@@ -313,8 +315,8 @@ impl Scene {
         }
         let (image, trouble) = py.detach(|| {
             let config = RenderConfig { antialias: antialias(smooth), ..RenderConfig::default() };
-            let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
-            let mut opened = device::open(device, config, &wanted, Tables::Changing);
+            let abilities = Abilities { head: scene.head != Head::Identity, ..Abilities::default() };
+            let mut opened = device::open(device, config, &abilities, Tables::Changing);
             let (mut seen, mut image) = (Evaluation::default(), Image::default());
             scene.at(t, &mut seen);
             let splats = scene.splats(&seen);
@@ -370,7 +372,8 @@ impl Scene {
     }
 
     /// Writes a file in the format of its extension: .html (player and scene as one page), .ply (at time t, in the
-    /// scene's axes), or a format of `splat4d convert`, .safetensors (everything, to go on with) and .s4d among them.
+    /// scene's axes), or a format of `splat4d convert`, .safetensors (everything, to continue with) and .s4d among
+    /// them.
     #[pyo3(signature = (path, t=None))]
     fn export(&self, py: Python<'_>, path: PathBuf, t: Option<f64>) -> PyResult<()> {
         t.map(time).transpose()?;
@@ -396,8 +399,9 @@ impl Scene {
         crate::errors::warn(py, &self.with_file(py, work)?)
     }
 
-    /// Writes a .ply per frame, `frame_00000.ply` and so on, into a folder; returns how many. `fps` [the scene's]; `start` and `end`
-    /// [the clip's] are seconds. `world`: in the capture's world, in double precision. `force` replaces such a sequence.
+    /// Writes a .ply per frame, `frame_00000.ply` and so on, into a folder; returns how many. `fps` [the scene's];
+    /// `start` and `end` [the clip's] are seconds. `world`: in the capture's world, in double precision. `force`
+    /// replaces such a sequence.
     #[pyo3(signature = (folder, *, fps=None, start=None, end=None, world=false, force=false))]
     #[allow(clippy::too_many_arguments)]
     fn export_frames(
@@ -423,9 +427,9 @@ impl Scene {
         Ok(count)
     }
 
-    /// Writes positions over time to a .csv or .json file: of every n-th Gaussian, of the `count` ones nearest to `near` at the
-    /// first time, of those with a `label`, or of the points that the file `points` lists (docs/track-points.md), with their
-    /// visibility. Times as in `export_frames`.
+    /// Writes positions over time to a .csv or .json file: of every n-th Gaussian, of the `count` ones nearest to
+    /// `near` at the first time, of those with a `label`, or of the points that the file `points` lists
+    /// (docs/track-points.md), with their visibility. Times as in `export_frames`.
     #[pyo3(signature = (path, *, every=1, near=None, count=1, label=None, points=None, fps=None, start=None, end=None, world=false))]
     #[allow(clippy::too_many_arguments)]
     fn export_tracks(
@@ -460,9 +464,9 @@ impl Scene {
         crate::errors::warn(py, &self.with_file(py, work)?)
     }
 
-    /// Films a camera path through space and time (docs/render.md): an .mp4 where ffmpeg is installed, an animated .png, or a
-    /// folder of images. `route`: "orbit", "train", "test", "camera=NAME" or a key-frame file. `start` and `end` are seconds of the
-    /// scene; `freeze` stops time there.
+    /// Films a camera path through space and time (docs/render.md): an .mp4 where ffmpeg is installed, an animated
+    /// .png, or a folder of images. `route`: "orbit", "train", "test", "camera=NAME" or a key-frame file. `start` and
+    /// `end` are seconds of the scene; `freeze` stops time there.
     #[pyo3(signature = (
         path, *, route=None, size=None, start=None, end=None, freeze=None, slow_motion=None, seconds=None, fps=None,
         channel="color", force=false, device="cpu"
@@ -512,8 +516,8 @@ impl Scene {
         crate::errors::warn(py, &self.with_file(py, work)?)
     }
 
-    /// Pose and time of images (JPEG, PNG or WebP) of the scene: a dict per image, as in `cameras.json`. `start`: a camera file or
-    /// `cameras.json` near them [the run's cameras]; `lens`: also find the focal length.
+    /// Pose and time of images (JPEG, PNG or WebP) of the scene: a dict per image, as in `cameras.json`. `start`: a
+    /// camera file or `cameras.json` near them [the run's cameras]; `lens`: also find the focal length.
     #[pyo3(signature = (images, *, start=None, lens=false))]
     fn localise(
         &self,
@@ -535,8 +539,8 @@ impl Scene {
         plain(py, &serde_json::Value::Array(found))
     }
 
-    /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path of
-    /// one.
+    /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path
+    /// of one.
     fn edit(&self, py: Python<'_>, edits: &Bound<'_, PyAny>) -> PyResult<Self> {
         let text: Option<String> =
             edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
@@ -579,7 +583,7 @@ impl Scene {
 }
 
 impl Scene {
-    /// Whether its run draws thin splats dimmed.
+    /// Whether its run renders thin splats dimmed.
     fn smooth(&self) -> bool {
         self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
     }

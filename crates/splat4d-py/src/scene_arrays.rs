@@ -22,7 +22,7 @@ const NO_DIRECTION: f64 = 1e-20;
 /// Highest order of the polynomials that positions may follow.
 const MAX_ORDER: usize = 3;
 
-/// Numbers of one Gaussian each, as they came: `rows` times `width`, and the axis of times before them, if there is one.
+/// Numbers of one Gaussian each, unconverted: `rows` times `width`, and the axis of times before them, if there is one.
 pub(crate) struct Given {
     what: &'static str,
     times: Option<usize>,
@@ -32,7 +32,7 @@ pub(crate) struct Given {
 }
 
 impl Given {
-    /// An array [N, ...shape] or, where `timed`, [T, N, ...shape]; `None` in a shape stands for any number.
+    /// An array [N, ...shape] or, where `timed`, [T, N, ...shape]; `None` in a shape represents any number.
     pub(crate) fn new(
         value: &Bound<'_, PyAny>,
         what: &'static str,
@@ -84,7 +84,7 @@ impl Given {
     }
 }
 
-/// What all Gaussians have, activated, as gsplat's `rasterization` takes it.
+/// Activated arrays of all Gaussians, as for gsplat's `rasterization`.
 pub(crate) struct Shapes {
     pub(crate) means: Given,
     pub(crate) quats: Given,
@@ -96,8 +96,8 @@ pub(crate) struct Shapes {
 impl Shapes {
     /// Reads the arrays; `timed`: means and quats may have an axis of times before that of Gaussians.
     ///
-    /// Errors: shapes, numbers that are not finite, quaternions of length 0, scales that are not positive, opacities outside
-    /// [0, 1], both or neither of `sh` and `colors`.
+    /// Errors: shapes, numbers that are not finite, quaternions of length 0, scales that are not positive, opacities
+    /// outside [0, 1], both or neither of `sh` and `colors`.
     pub(crate) fn new(
         means: &Bound<'_, PyAny>,
         quats: &Bound<'_, PyAny>,
@@ -165,7 +165,7 @@ impl Shapes {
     }
 }
 
-/// How Gaussians move and how long they live.
+/// Motion and lifespans of Gaussians.
 pub(crate) struct Moving<'a, 'py> {
     /// [T] seconds of the poses.
     pub(crate) times: Option<&'a Bound<'py, PyAny>>,
@@ -289,7 +289,7 @@ fn spacetime(shapes: &Shapes, moving: &Moving<'_, '_>, polynomial: bool) -> PyRe
     Ok((Layer::new("arrays", params, motion, kind), clip))
 }
 
-/// What a scene says of itself next to its Gaussians.
+/// Metadata of a scene.
 pub(crate) struct About<'a, 'py> {
     pub(crate) clip: Option<[f64; 2]>,
     pub(crate) fps: f64,
@@ -297,7 +297,7 @@ pub(crate) struct About<'a, 'py> {
     pub(crate) background: Option<&'a Bound<'py, PyAny>>,
 }
 
-/// The direction that is up where nothing else is said: that of the y axis, as in graphics programs.
+/// The up direction unless stated: that of the y axis, as in graphics programs.
 const UP: [f64; 3] = [0.0, 1.0, 0.0];
 
 impl About<'_, '_> {

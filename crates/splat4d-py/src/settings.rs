@@ -5,8 +5,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d_train::recipe::Recipe;
 
-/// Keyword arguments as names and values in TOML. A setting of a table has two underscores in Python. Errors: a value that no
-/// setting can have.
+/// Keyword arguments as names and values in TOML. A setting of a table has two underscores in Python. Errors: a value
+/// that no setting can have.
 pub(crate) fn assignments(settings: Option<&Bound<'_, PyDict>>) -> PyResult<Vec<(String, String)>> {
     let mut out = Vec::new();
     for (name, value) in settings.into_iter().flatten() {
@@ -14,7 +14,7 @@ pub(crate) fn assignments(settings: Option<&Bound<'_, PyDict>>) -> PyResult<Vec<
         // Numbers of NumPy become Python's.
         let value = value.call_method0("item").unwrap_or(value);
         let text: String = value.py().import("json")?.call_method1("dumps", (&value,))?.extract()?;
-        // What JSON calls null is nothing that a setting can be.
+        // No setting can be null.
         if value.is_none() {
             return Err(bad_input(format!("`{name}` is None"), "Leave it out for its default"));
         }

@@ -24,12 +24,13 @@ use std::sync::atomic::AtomicBool;
 ///
 /// `settings` are those of docs/recipe.md: `iterations=300`, `downscale=2`; a setting of a table has two underscores,
 /// `densify__max_cap=20000`. `motion` is the name of a motion model or a `Motion` of your own; without one, the capture
-/// decides. `progress` is called with every event, a dict as in docs/events.md; without one, a bar is shown on terminals and in
-/// notebooks, and with `progress=False` nothing is. `loss(image, truth, view)` gets arrays [h, w, 3] and returns (value,
-/// gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays have half of the size, with
-/// `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file, measure held-out views, film an orbit and
-/// write the report, as the command does; `minutes` includes it. `force` replaces a run that is in `out` already. Ctrl-C, or an exception in a
-/// function of yours, stops with a checkpoint; `resume` continues from there.
+/// decides. `progress` is called with every event, a dict as in docs/events.md; without one, a bar is shown on
+/// terminals and in notebooks, and with `progress=False` nothing is. `loss(image, truth, view)` gets arrays [h, w, 3]
+/// and returns (value, gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays
+/// have half of the size, with `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file,
+/// measure held-out views, film an orbit and write the report, as the command does; `minutes` includes it. `force`
+/// replaces a run that is in `out` already. Ctrl-C, or an exception in a function of yours, stops with a checkpoint;
+/// `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (
     capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="cpu", evaluate=false,
@@ -92,7 +93,8 @@ fn finish(evaluate: bool) -> Finish {
     if evaluate { Finish::All } else { Finish::Scene }
 }
 
-/// Continues the run in a folder from its newest checkpoint. A run that started with a `loss` or a `Motion` needs it again.
+/// Continues the run in a folder from its newest checkpoint. A run that started with a `loss` or a `Motion` needs it
+/// again.
 #[pyfunction]
 #[pyo3(signature = (run, *, motion=None, progress=None, loss=None, device="cpu", evaluate=false))]
 #[allow(clippy::too_many_arguments)]
@@ -120,10 +122,10 @@ pub(crate) fn resume(
     listener.drive(py, options, |options, stop, listen| training::resume(&path, options, stop, listen))
 }
 
-/// Who hears of a run, and may end it.
+/// Listeners of a run, which may end it.
 struct Listener {
     progress: Option<Py<PyAny>>,
-    /// Whether the caller's own function hears of warnings; they are Python's otherwise.
+    /// Whether the caller's function gets warnings; otherwise they are Python warnings.
     told: bool,
     loss: Option<Py<PyAny>>,
     raised: Arc<Raised>,
@@ -196,8 +198,8 @@ impl Listener {
     }
 }
 
-/// Adds to an exception where the run is saved, where Python has room for that (3.11).
+/// Adds the run's folder to an exception, if Python supports notes (3.11).
 fn note(py: Python<'_>, error: &PyErr, run: &Path) {
-    let text = format!("The run is saved in {0}; go on with splat4d.resume({0:?})", run.display());
+    let text = format!("The run is saved in {0}; continue with splat4d.resume({0:?})", run.display());
     let _ = error.value(py).call_method1("add_note", (text,));
 }

@@ -28,7 +28,7 @@ CAMERA = splat4d.Camera.look_at([0.3, 0.4, -4], [0, 0, 0], [0, 1, 0], width=32, 
 
 
 class Arrays(InFolder):
-    def test_gaussians_come_back_as_they_were_given(self):
+    def test_gaussians_round_trip(self):
         given = cloud()
         g = splat4d.Gaussians(**given)
         now = splat4d.Scene.from_arrays(**given).at(0.0)
@@ -64,7 +64,7 @@ class Arrays(InFolder):
         self.assertEqual([len(scene.at(k / 5)) for k in range(3)], [10, 30, 20])
         self.assertEqual((scene.up, scene.background, len(scene)), ([0, -1, 0], [1, 1, 1], 60))
 
-    def test_what_is_wrong_is_named(self):
+    def test_invalid_arrays_are_named(self):
         wrong = {
             "means": (np.zeros((40, 2)), "means has the shape"),
             "quats": (np.zeros((40, 4)), "length 0"),
@@ -103,7 +103,7 @@ class Arrays(InFolder):
         objects = splat4d.command("info", exact)
         self.assertIn("scene", [o["type"] for o in objects])
 
-    def test_times_outside_of_the_clip_are_warned_of(self):
+    def test_times_outside_the_clip_warn(self):
         moving = splat4d.Scene.from_arrays(**cloud(), velocities=np.ones((40, 3)), clip=(0, 1))
         with self.assertWarnsRegex(UserWarning, "outside of the scene's clip"):
             moving.at(99)
@@ -114,7 +114,7 @@ class Arrays(InFolder):
 
 
 class Gradients(InFolder):
-    def test_they_are_those_of_differences(self):
+    def test_gradients_equal_finite_differences(self):
         n = 3
         scene = splat4d.Scene.from_arrays(**cloud(n), velocities=np.full((n, 3), 0.3))
         # A smooth weight, so that what is cut off at faint edges counts for little.
@@ -139,7 +139,7 @@ class Gradients(InFolder):
         opaque = scene.render(CAMERA, 0.4, requires_grad=True).backward(alpha=np.ones((24, 32)))
         self.assertTrue((opaque["layers.0.opacity_logits"] >= 0).all() and opaque["layers.0.opacity_logits"].max() > 0)
 
-    def test_descent_finds_a_picture(self):
+    def test_gradient_descent_fits_an_image(self):
         truth = splat4d.Scene.from_arrays(**cloud(20)).render(CAMERA, 0)
         scene = splat4d.Scene.from_arrays(**cloud(20) | {"sh": np.zeros((20, 1, 3))})
         value = lambda s: float(((s.render(CAMERA, 0) - truth) ** 2).mean())
@@ -151,7 +151,7 @@ class Gradients(InFolder):
             scene = scene.with_parameters({"layers.0.sh": sh - 300 * d["layers.0.sh"]})
         self.assertLess(value(scene), 0.3 * before)
 
-    def test_what_has_no_gradients_is_refused(self):
+    def test_scenes_without_gradients_are_refused(self):
         scene = splat4d.Scene.from_arrays(**cloud())
         with self.assertRaisesRegex(splat4d.Error, "has no array"):
             scene.with_parameters({"means": np.zeros((40, 3))})
@@ -235,7 +235,7 @@ class Motions(InFolder):
         a, b = scene.render(camera, 0.05), splat4d.open(self.folder / "a.s4d").render(camera, 0.05)
         self.assertGreater(splat4d.metrics(b, a)["PSNR"], 30)
 
-    def test_gradients_through_a_motion_are_those_of_differences(self):
+    def test_gradients_through_a_motion_equal_finite_differences(self):
         run = self.train("a", own(), iterations=4)
         scene = run.scene()
         camera = scene.cameras[0][1].downscaled(16)
@@ -255,7 +255,7 @@ class Motions(InFolder):
             # Where a pixel crosses the smallest alpha, the image jumps, and one difference measures the jump.
             self.assertLess(np.median(errors), 0.1 * largest, f"{name}: {errors} of {largest}")
 
-    def test_mistakes_in_a_motion_come_out_as_themselves(self):
+    def test_errors_in_a_motion_are_raised_unchanged(self):
         def broken(params, t):
             raise RuntimeError("mine")
 
@@ -270,7 +270,7 @@ class Motions(InFolder):
             with self.assertRaises(splat4d.Error):
                 self.train("c", motion)
 
-    def test_a_run_can_be_replaced_and_says_how(self):
+    def test_a_run_can_be_replaced_and_the_error_explains_how(self):
         self.train("a", "spacetime", iterations=2)
         with self.assertRaisesRegex(splat4d.Error, r'splat4d\.resume\("[^"]+"\), replace it with force=True'):
             self.train("a", "spacetime", iterations=2)

@@ -42,7 +42,7 @@ class NumpyReader(unittest.TestCase):
         self.assertEqual(wrong, [])
         self.assertGreater(count, 30)
 
-    def test_it_needs_numpy_and_nothing_else(self):
+    def test_only_numpy_is_imported(self):
         text = (CLIENTS / "python/s4d.py").read_text("utf-8")
         self.assertLessEqual(len(text.splitlines()), MOST_LINES)
         names = set()
@@ -124,7 +124,7 @@ class LibS4D(InFolder):
             expected = (features[row] if features else None) or [0.0] * len(feature)
             self.assertTrue(s4d.close(feature, expected))
 
-    def test_what_is_to_be_refused(self):
+    def test_invalid_files_are_refused(self):
         for name in json.loads((SET / "refused/refused.json").read_text("utf-8")):
             done = self.run_tool("verify", SET / "refused" / name)
             self.assertEqual(done.returncode, 2, name)

@@ -74,7 +74,7 @@ class Errors(InFolder):
         self.refuses("fov_y", make.look_at, [1, 0, 0], [0, 0, 0], [0, 0, 1], fov_y=200)
         self.refuses("position", make.look_at, [1, 0], [0, 0, 0], [0, 0, 1])
 
-    def test_pictures(self):
+    def test_images(self):
         good = np.zeros((30, 40, 3), np.float32)
         bad = good.copy()
         bad[2, 5, 1] = np.nan
@@ -98,7 +98,7 @@ class Errors(InFolder):
         refuses("images of 2", [[picture], [picture]], times=[0.0])
         refuses(r"images\[0\]\[0\] has the shape \[40, 30, 3\]", [[picture.transpose(1, 0, 2)]], times=[0.0])
         refuses(r"dtype int64", [[picture.astype(np.int64)]], times=[0.0])
-        refuses(r"images\[0\]\[0\] is no array", [["picture"]], times=[0.0])
+        refuses(r"images\[0\]\[0\] is not an array", [["picture"]], times=[0.0])
         refuses(r"is 1.5 at row 0, column 0", [[picture + 1.5]], times=[0.0])
         bad = picture.copy()
         bad[3, 4] = np.nan
@@ -154,7 +154,7 @@ class Errors(InFolder):
             round_()
         self.assertLess(resident() - before, ROUNDS * LEAK)
 
-    def test_pictures_that_are_gone_are_named(self):
+    def test_missing_images_are_named(self):
         camera = splat4d.Camera(40, 30, 50.0)
         picture = np.zeros((30, 40, 3), np.uint8)
         capture = splat4d.Capture.from_arrays([[picture, picture]], [camera], fps=30, folder=self.folder / "take")

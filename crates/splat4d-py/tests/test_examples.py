@@ -31,7 +31,7 @@ class Examples(InFolder):
             self.assertTrue((self.folder / file).exists(), f"{name} writes {file}")
         return done.stdout
 
-    def test_they_are_short_and_all_are_run(self):
+    def test_examples_are_short_and_all_are_run(self):
         here = pathlib.Path(__file__).read_text()
         for example in FOLDER.glob("*.py"):
             self.assertIn(f'"{example.name}"', here)

@@ -29,7 +29,7 @@ class Scenes(InFolder):
         self.scene = splat4d.open(PLAYABLE)
         self.camera = self.scene.cameras[0][1].downscaled(2)
 
-    def test_a_moment_is_arrays_of_activated_numbers(self):
+    def test_a_time_gives_arrays_of_activated_values(self):
         now = self.scene.at(0.4)
         n = len(now)
         self.assertTrue(0 < n <= len(self.scene))
@@ -44,7 +44,7 @@ class Scenes(InFolder):
         later = self.scene.at(0.8)
         self.assertFalse(len(later) == n and np.array_equal(later.means, now.means), "it moves")
 
-    def test_the_arrays_are_what_is_exported_as_plain_gaussians(self):
+    def test_the_arrays_equal_the_exported_gaussians(self):
         now, file = self.scene.at(0.4), self.folder / "now.ply"
         self.scene.export(file, 0.4)
         still = splat4d.open(file).at(0.0)
@@ -53,7 +53,7 @@ class Scenes(InFolder):
         np.testing.assert_allclose(covariances(still), covariances(now), rtol=1e-3, atol=1e-9)
         np.testing.assert_array_equal(still.sh, now.sh)
 
-    def test_a_picture_is_the_commands(self):
+    def test_a_render_equals_the_commands(self):
         picture = self.scene.render(self.camera, 0.4)
         self.assertEqual((picture.shape, picture.dtype), ((150, 200, 3), np.float32))
         self.assertGreater(picture.std(), 0.05, "something is seen")
@@ -67,7 +67,7 @@ class Scenes(InFolder):
         red = self.scene.render(self.camera, 0.4, background=[1, 0, 0])
         np.testing.assert_allclose(red[..., 0] - black[..., 0], 1 - alpha, atol=1e-5)
 
-    def test_other_channels_are_numbers_of_what_is_seen(self):
+    def test_other_channels_are_arrays_of_visible_surfaces(self):
         alpha = self.scene.render(self.camera, 0.4, channel="alpha")
         for channel, shape in [("flow", (2,)), ("velocity", (3,)), ("normal", (3,)), ("life", ()), ("uncertainty", ())]:
             numbers = self.scene.render(self.camera, 0.4, channel=channel)
@@ -89,14 +89,14 @@ class Scenes(InFolder):
         bytes_ = (255 * picture + 0.5).astype(np.uint8)
         self.assertNotIn("PSNR", splat4d.metrics(bytes_, bytes_), "infinite is no number")
 
-    def test_tracks_follow_gaussians_while_they_live(self):
+    def test_tracks_follow_gaussians_during_their_lifespans(self):
         tracks = self.scene.tracks(every=500, times=[0.2, 0.4])
         self.assertEqual(tracks.points.shape, (len(tracks.rows), 2, 3))
         alive = np.isfinite(tracks.points[:, 1, 0])
         now = {tuple(m) for m in self.scene.at(0.4).means}
         self.assertTrue(alive.any() and all(tuple(p) in now for p in tracks.points[alive, 1]))
 
-    def test_files_are_written_that_open_again(self):
+    def test_written_files_open_again(self):
         self.scene.export(self.folder / "again.spz", 0.4)
         self.scene.export(self.folder / "again.html")
         self.scene.bake(self.folder / "again.s4d", tolerance=1.0)
@@ -105,7 +105,7 @@ class Scenes(InFolder):
         self.assertEqual(len(splat4d.open(self.folder / "again.spz")), len(self.scene.at(0.4)))
         self.assertGreater(len(splat4d.open(self.folder / "again.s4d")), 1000)
 
-    def test_films_sequences_tracks_and_facts_need_no_command(self):
+    def test_films_sequences_tracks_and_info_need_no_command(self):
         self.assertEqual(splat4d.info(PLAYABLE)["type"], "playback")
         self.scene.film(self.folder / "film", size=(16, 12), fps=1, seconds=1)
         self.assertTrue((self.folder / "film" / "00000.png").is_file())
@@ -118,7 +118,7 @@ class Scenes(InFolder):
         with self.assertRaisesRegex(splat4d.Error, "channel"):
             self.scene.film(self.folder / "film.png", channel="heat")
 
-    def test_cameras_come_and_go_unchanged(self):
+    def test_cameras_round_trip(self):
         _, camera = self.scene.cameras[3]
         same = splat4d.Camera(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_to_camera, camera.near
@@ -128,7 +128,7 @@ class Scenes(InFolder):
         looking = splat4d.Camera.look_at([3, 0, 1], [0, 0, 1], [0, 0, 1], width=40, height=30)
         np.testing.assert_allclose(looking.world_to_camera @ [0, 0, 1, 1], [0, 0, 3, 1], atol=1e-9)
 
-    def test_others_may_work_meanwhile(self):
+    def test_other_threads_run_during_a_render(self):
         camera = splat4d.Camera.look_at([3, 3, 1.5], [0, 0, 0.8], self.scene.up, width=2000, height=1500)
         thread = threading.Thread(target=self.scene.render, args=(camera, 0.4))
         thread.start()

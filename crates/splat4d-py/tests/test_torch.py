@@ -51,7 +51,7 @@ class Torch(InFolder):
         for share in (0.0, 0.2, 1.0):
             self.agree(picture, truth, share)
 
-    def test_pictures_of_a_run_are_tensors_without_a_copy(self):
+    def test_renders_of_a_run_are_tensors_without_a_copy(self):
         steps = []
 
         def loss(picture, truth, view):
@@ -65,7 +65,7 @@ class Torch(InFolder):
         self.assertTrue(splat4d.train(KNIGHT, self.folder / "torch", loss=loss, **SHORT).finished)
         self.assertEqual(sorted(set(steps)), list(range(SHORT["iterations"])))
 
-    def test_tensors_are_pictures_too(self):
+    def test_tensors_are_accepted_as_images(self):
         picture = torch.rand(30, 40, 3)
         self.assertEqual(splat4d.metrics(picture, 0.9 * picture), splat4d.metrics(picture.numpy(), 0.9 * picture.numpy()))
         camera = splat4d.Camera(40, 30, 50.0)
@@ -75,7 +75,7 @@ class Torch(InFolder):
             splat4d.metrics(picture.clone().requires_grad_(), picture)
         self.assertEqual(caught.exception.kind, "bad_input")
 
-    def test_a_gradient_that_is_still_a_graph_is_told_so(self):
+    def test_a_gradient_with_a_graph_is_refused(self):
         def loss(picture, truth, view):
             return 0.0, torch.from_numpy(picture).requires_grad_()
 

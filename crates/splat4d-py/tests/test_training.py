@@ -23,7 +23,7 @@ class Training(InFolder):
     def train(self, name, **more):
         return splat4d.train(KNIGHT, self.folder / name, **{**SHORT, **more})
 
-    def test_it_gives_the_bits_of_the_command(self):
+    def test_training_gives_the_bits_of_the_command(self):
         events = []
         run = self.train("python", progress=events.append)
         sets = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
@@ -52,7 +52,7 @@ class Training(InFolder):
                 work()
             self.assertEqual(raised.exception.kind, "bad_input")
 
-    def test_a_capture_is_trained_as_it_was_opened_unless_told(self):
+    def test_a_capture_is_trained_with_its_options_unless_overridden(self):
         capture = splat4d.Capture(KNIGHT, downscale=8, hold_out="camera=0")
         few = dict(iterations=50, max_frames=2, motion="still")
         recipe = lambda run: (run.path / "recipe.toml").read_text()
@@ -84,7 +84,7 @@ class Training(InFolder):
         self.assertTrue(done.finished and steps)
         self.assertEqual(self.scene_bytes(done), self.scene_bytes(whole))
 
-    def test_an_exception_in_progress_is_raised_and_the_run_goes_on(self):
+    def test_an_exception_in_progress_is_raised_and_the_run_continues(self):
         def fail(event):
             if event["type"] == "checkpoint":
                 raise ValueError("no more")
@@ -93,7 +93,7 @@ class Training(InFolder):
             self.train("stopped", progress=fail)
         self.assertTrue(splat4d.resume(self.folder / "stopped").finished)
 
-    def test_a_loss_counts_and_one_that_fails_costs_no_bit(self):
+    def test_a_loss_is_applied_and_a_failing_one_changes_no_bit(self):
         plain, whole = self.train("plain"), self.train("whole", loss=darker)
         self.assertNotEqual(self.scene_bytes(plain), self.scene_bytes(whole))
 
@@ -110,7 +110,7 @@ class Training(InFolder):
         done = splat4d.resume(self.folder / "failed", loss=darker)
         self.assertEqual(self.scene_bytes(done), self.scene_bytes(whole))
 
-    def test_a_loss_that_answers_nonsense_is_told_so(self):
+    def test_invalid_results_of_a_loss_are_errors(self):
         for name, answer, words in [
             ("none", lambda p: None, "did not return"),
             ("shape", lambda p: (0.0, p[:-1]), "shape"),
@@ -121,7 +121,7 @@ class Training(InFolder):
                 self.train(name, loss=lambda p, t, v, answer=answer: answer(p))
             self.assertFalse(splat4d.Run(self.folder / name).finished)
 
-    def test_pictures_in_memory_become_a_capture_and_a_run_that_resumes(self):
+    def test_images_in_memory_become_a_capture_and_a_run_that_resumes(self):
         scene = splat4d.open(KNIGHT.parent / "knight.s4d")
         cameras = [camera.downscaled(8) for _, camera in scene.cameras[:4]]
         times = [0.0, 0.3, 0.6]

@@ -1,12 +1,13 @@
-// A dynamic scene of Gaussians in Babylon.js: `const object = new Splat4D('scene.s4d', scene)`; it follows the scene's active camera
-// by itself. Babylon.js sorts and renders it; motion and colours are evaluated on the CPU. Its interface takes rotations and colours
-// in bytes.
+// A dynamic scene of Gaussians in Babylon.js: `const object = new Splat4D('scene.s4d', scene)`; it follows the scene's
+// active camera on its own. Babylon.js sorts and renders it; motion and colours are evaluated on the CPU. Its interface
+// takes rotations and colours in bytes.
 
 import { GaussianSplattingMesh, Matrix, Quaternion, TransformNode, Vector3 } from '@babylonjs/core';
 import { AXES, Feed } from './engine.js';
 import { LOW_PASS } from './player/constants.js';
 
-/// Bytes of a Gaussian in the layout that `updateData` takes: position and scale as f32, colour and opacity, rotation w x y z.
+/// Bytes of a Gaussian in the layout that `updateData` takes: position and scale as f32, colour and opacity, rotation w
+/// x y z.
 const ROW = 32;
 /// The shader adds `kernelSize` to variances of an image of twice the size (gaussianSplatting.fx).
 const KERNEL = 4 * LOW_PASS;
@@ -28,9 +29,9 @@ export class Splat4D {
   #given = false;
   #gone = false;
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the node's axis ('x', 'y', 'z') that points up as the file's up does;
-  /// null keeps the file's axes. In a left-handed scene, the default of Babylon.js, z is mirrored. `budget`: bytes of pages that
-  /// stay in memory. `onchange()`: pages came. `onerror(error)`: pages cannot be read.
+  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the node's axis ('x', 'y', 'z') that points up as the
+  /// file's up does; null keeps the file's axes. In a left-handed scene, the default of Babylon.js, z is mirrored.
+  /// `budget`: bytes of pages that stay in memory. `onchange()`: pages arrived. `onerror(error)`: pages cannot be read.
   constructor(source, scene, { up = 'y', ...options } = {}) {
     this.#scene = scene;
     this.node = new TransformNode('splat4d', scene);
@@ -57,8 +58,8 @@ export class Splat4D {
     this.ready.catch(() => {});
   }
 
-  /// Moves the clock and gives Babylon.js the Gaussians of its time, with the colours that the camera sees. Each frame of the scene
-  /// calls it.
+  /// Moves the clock and gives Babylon.js the Gaussians of its time, with the colours that the camera sees. Each frame
+  /// of the scene calls it.
   update(camera = this.#scene.activeCamera, now = performance.now()) {
     const { mesh } = this;
     if (!mesh || !camera) return;
@@ -88,7 +89,8 @@ export class Splat4D {
     this.#given = true;
   }
 
-  /// Sets the clock and resolves when the pages of that time are there; the next frame shows it. Rejects where they cannot be read.
+  /// Sets the clock and resolves when the pages of that time are there; the next frame shows it. Rejects where they
+  /// cannot be read.
   async load(time) {
     await this.#feed.load(time);
     await this.ready;

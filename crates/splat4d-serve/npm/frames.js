@@ -1,5 +1,6 @@
-// The Gaussians of a playback file at any time as arrays, for engines that render them by themselves: Spark, PlayCanvas,
-// Babylon.js, or yours. It streams like the player, and evaluates motion and spherical harmonics on the CPU.
+// The Gaussians of a playback file at any time as arrays, for engines that render them by themselves: Spark,
+// PlayCanvas, Babylon.js, or yours. It streams like the player, and evaluates motion and spherical harmonics on the
+// CPU.
 //
 //   const frames = new Frames('scene.s4d');
 //   await frames.load(0.5);
@@ -19,8 +20,8 @@ const { ALPHA_MIN, KeyMask, lerp, path, signed10 } = globalThis.splat4dSort;
 const BLOCK = 256,
   HEADER = 24,
   WORDS = 8;
-/// Numbers kept of a Gaussian: mean 3, velocity 3, rotation wxyz 4, its rate 4, scale 3, opacity, colour 3, half-width, softness,
-/// centre; the last three of a page's clock, s.
+/// Numbers kept of a Gaussian: mean 3, velocity 3, rotation wxyz 4, its rate 4, scale 3, opacity, colour 3, half-width,
+/// softness, centre; the last three of a page's clock, s.
 const MEAN = 0,
   VELOCITY = 3,
   ROTATION = 6,
@@ -168,8 +169,9 @@ export class Frames {
   /// Why pages are missing, the newest reason.
   #failure = null;
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages came: what `at` returns changes then.
-  /// `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of pages that stay in memory.
+  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages arrived: what `at` returns
+  /// changes then. `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of
+  /// pages that stay in memory.
   constructor(source, { onchange = () => {}, onerror = () => {}, budget } = {}) {
     this.ready = SceneFile.open(source).then((file) => {
       if (this.#gone) return file.close();
@@ -218,7 +220,7 @@ export class Frames {
     return this.meta ? this.meta.clip[1] - this.meta.clip[0] : 0;
   }
 
-  /// Moves the clock: once a frame. A clock whose pages have not arrived waits.
+  /// Moves the clock: once per frame. A clock whose pages have not arrived waits.
   tick(now = performance.now()) {
     if (!this.#stream) return;
     const { clip, fps } = this.meta;
@@ -246,10 +248,10 @@ export class Frames {
     if (this.#failure && !whole) throw this.#failure;
   }
 
-  /// The Gaussians that are visible at `time`, colours as seen from `eye` (null: base colours): {count, position 3, rotation 4 as
-  /// x y z w, scale 3, opacity 1, color 3 per Gaussian}, in the file's axes. `forward`: the camera's unit direction; what is nearer
-  /// than the capture's cameras could see is left out then, as the player does. Colours are display values, at least 0. The arrays
-  /// have room for `capacity` Gaussians and are those of the next call too.
+  /// The Gaussians that are visible at `time`, colours as seen from `eye` (null: base colours): {count, position 3,
+  /// rotation 4 as x y z w, scale 3, opacity 1, color 3 per Gaussian}, in the file's axes. `forward`: the camera's unit
+  /// direction; what is nearer than the capture's cameras could see is left out then, as the player does. Colours are
+  /// display values, at least 0. The arrays have room for `capacity` Gaussians and are those of the next call too.
   at(time, eye = null, forward = null) {
     const { capacity } = this;
     this.#arrays ??= {

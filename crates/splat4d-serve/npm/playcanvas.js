@@ -1,6 +1,6 @@
 // A dynamic scene of Gaussians in PlayCanvas' engine: `app.root.addChild(new Splat4D(app, 'scene.s4d').entity)`, and
-// `object.update(camera)` before each frame. The engine sorts and renders it together with its other splats; motion and colours
-// are evaluated on the CPU.
+// `object.update(camera)` before each frame. The engine sorts and renders it together with its other splats; motion and
+// colours are evaluated on the CPU.
 
 import {
   Entity, GSplatContainer, GSplatFormat, Mat4, PIXELFORMAT_RGBA32F, Quat, Vec3, WORKBUFFER_UPDATE_ONCE,
@@ -20,8 +20,8 @@ fn getCenter() -> vec3f { return loadDataCenter().xyz; }
 fn getColor() -> vec4f { return loadDataColor(); }
 fn getScale() -> vec3f { return loadDataScale().xyz; }
 fn getRotation() -> vec4f { return loadDataRotation(); }`;
-/// The engine's kernel is exp(−d²/2), lowered so that it ends at 0 where d² = 8 (gsplatPS). A Gaussian of this many times the
-/// variance has the same area there.
+/// The engine's kernel is exp(−d²/2), lowered so that it ends at 0 where d² = 8 (gsplatPS). A Gaussian of this many
+/// times the variance has the same area there.
 const EDGE = Math.exp(-4),
   WIDER = 1 / (1 - (4 * EDGE) / (1 - EDGE));
 /// Variance that the engine adds in the image, px²: its shader adds 0.3 at twice the focal length (gsplatCornerVS).
@@ -44,9 +44,9 @@ export class Splat4D {
   #container = null;
   #gone = false;
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the entity's axis ('x', 'y', 'z') that points up as the file's up
-  /// does; null keeps the file's axes. `budget`: bytes of pages that stay in memory. `onchange()`: pages came.
-  /// `onerror(error)`: pages cannot be read.
+  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the entity's axis ('x', 'y', 'z') that points up as the
+  /// file's up does; null keeps the file's axes. `budget`: bytes of pages that stay in memory. `onchange()`: pages
+  /// came. `onerror(error)`: pages cannot be read.
   constructor(app, source, { up = 'y', ...options } = {}) {
     this.#device = app.graphicsDevice;
     this.entity.addChild(this.#child);
@@ -64,8 +64,8 @@ export class Splat4D {
     this.ready.catch(() => {});
   }
 
-  /// Moves the clock and gives the engine the Gaussians of its time, with the colours that the entity `camera` sees. Call it before
-  /// each frame: `app.on('update', () => object.update(camera))`.
+  /// Moves the clock and gives the engine the Gaussians of its time, with the colours that the entity `camera` sees.
+  /// Call it before each frame: `app.on('update', () => object.update(camera))`.
   update(camera, now = performance.now()) {
     const container = this.#container;
     if (!container) return;
@@ -110,11 +110,13 @@ export class Splat4D {
     container.centers.set(position);
     for (let i = count; count && i < this.frames.capacity; i++) container.centers.set(position.subarray(0, 3), 3 * i);
     container.update();
-    // Otherwise the engine, whose counts did not change, sorts the new centres and goes on rendering the former Gaussians.
+    // Otherwise the engine, whose counts did not change, sorts the new centres and continues rendering the former
+    // Gaussians.
     this.#child.gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
   }
 
-  /// Sets the clock and resolves when the pages of that time are there; the next `update` shows it. Rejects where they cannot be read.
+  /// Sets the clock and resolves when the pages of that time are there; the next `update` shows it. Rejects where they
+  /// cannot be read.
   async load(time) {
     await this.#feed.load(time);
     await this.ready;

@@ -1,13 +1,15 @@
-// A dynamic scene of Gaussians in Spark (three.js): `scene.add(new Splat4D('scene.s4d'))`, and `object.update(camera)` before each
-// frame. Spark sorts and renders it together with its other splats; motion and colours are evaluated on the CPU.
+// A dynamic scene of Gaussians in Spark (three.js): `scene.add(new Splat4D('scene.s4d'))`, and `object.update(camera)`
+// before each frame. Spark sorts and renders it together with its other splats; motion and colours are evaluated on the
+// CPU.
 
 import * as THREE from 'three';
 import { ExtSplats, SplatMesh, utils } from '@sparkjsdev/spark';
 import { AXES, Feed } from './engine.js';
 import { ALPHA_SPAN, LOW_PASS } from './player/constants.js';
 
-/// Settings of Spark's renderer with which it renders as the player does: `new SparkRenderer({ renderer, ...SETTINGS })`. By
-/// default, Spark assumes models that were trained with an antialiasing filter: it widens Gaussians and lowers their opacity.
+/// Settings of Spark's renderer with which it renders as the player does:
+/// `new SparkRenderer({ renderer, ...SETTINGS })`. By default, Spark assumes models that were trained with an
+/// antialiasing filter: it widens Gaussians and lowers their opacity.
 export const SETTINGS = {
   preBlurAmount: LOW_PASS, blurAmount: 0, maxStdDev: ALPHA_SPAN, minAlpha: 1 / 255, sortRadial: false, accumExtSplats: true,
 };
@@ -26,8 +28,9 @@ export class Splat4D extends THREE.Object3D {
   #splats = null;
   #gone = false;
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the object's axis ('x', 'y', 'z') that points up as the file's up
-  /// does; null keeps the file's axes. `budget`: bytes of pages that stay in memory. `onchange()`: pages came.
+  /// `source`: an address, File, Blob or ArrayBuffer. `up`: the object's axis ('x', 'y', 'z') that points up as the
+  /// file's up does; null keeps the file's axes. `budget`: bytes of pages that stay in memory. `onchange()`: pages
+  /// arrived.
   /// `onerror(error)`: pages cannot be read.
   constructor(source, { up = 'y', ...options } = {}) {
     super();
@@ -45,7 +48,8 @@ export class Splat4D extends THREE.Object3D {
     this.ready.catch(() => {});
   }
 
-  /// Moves the clock and gives Spark the Gaussians of its time, with the colours that `camera` sees. Call it before each frame.
+  /// Moves the clock and gives Spark the Gaussians of its time, with the colours that `camera` sees. Call it before
+  /// each frame.
   update(camera, now = performance.now()) {
     const { mesh } = this;
     if (!mesh) return;
@@ -65,11 +69,13 @@ export class Splat4D extends THREE.Object3D {
       );
     }
     for (const texture of textures) texture.needsUpdate = true;
-    // Spark shows them once their order is there; a version without a new mapping would be shown in the order of another time.
+    // Spark shows them once their order is there; a version without a new mapping would be shown in the order of
+    // another time.
     mesh.updateMappingVersion();
   }
 
-  /// Sets the clock and resolves when the pages of that time are there; the next `update` shows it. Rejects where they cannot be read.
+  /// Sets the clock and resolves when the pages of that time are there; the next `update` shows it. Rejects where they
+  /// cannot be read.
   async load(time) {
     await this.#feed.load(time);
     await this.ready;

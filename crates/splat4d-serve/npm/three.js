@@ -1,8 +1,9 @@
 // A moving scene of Gaussians as an object of three.js (WebGLRenderer): `scene.add(new Splat4D('knight.s4d'))`.
 //
-// Gaussians are drawn after opaque meshes, the farthest first, each tested against the depth that meshes left: at its centre,
-// so that a mesh cuts through the scene between Gaussians. They write no depth. Colours are blended as they were learnt, in
-// display values, which is what three.js writes to the canvas; into a linear render target they come out too bright.
+// Gaussians are drawn after opaque meshes, the farthest first, each tested against the depth that meshes left: at its
+// centre, so that a mesh cuts through the scene between Gaussians. They write no depth. Colours are blended as they
+// were learnt, in display values, which is what three.js writes to the canvas; into a linear render target they come
+// out too bright.
 
 import * as THREE from 'three';
 import { NEAR } from './player/camera.js';
@@ -19,10 +20,10 @@ const { ROW } = globalThis.splat4dSort;
 /// Rows of the words' texture to begin with.
 const FIRST_ROWS = 32;
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
-/// Stands for a clock that waits for pages: no other time can be rendered.
+/// Marks a clock that waits for pages: no other time can be rendered.
 const HOLD = () => null;
 
-// The image's rows go up here, so that `focal.y` is negative; `origin`: where the viewport begins.
+// The image's rows run upwards here, so that `focal.y` is negative; `origin`: where the viewport begins.
 const VERTEX =
   SPLAT.replace('#version 300 es\n', '') +
   `
@@ -111,8 +112,8 @@ export class Splat4D extends THREE.Mesh {
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better image can be drawn: pages
   /// came,
-  /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
-  /// axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
+  /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`:
+  /// the object's axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
   constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();
     geometry.setIndex(new THREE.BufferAttribute(corners(), 1));
@@ -175,7 +176,7 @@ export class Splat4D extends THREE.Mesh {
     return this.#schedule.shown?.time ?? this.#time;
   }
 
-  /// Plays by itself from now on, as often as it is rendered.
+  /// Plays from now on, as often as it is rendered.
   play() {
     if (this.#playing) return;
     const [first, last] = this.meta?.clip ?? [0, Infinity];
@@ -204,7 +205,7 @@ export class Splat4D extends THREE.Mesh {
     this.#speed = Math.min(Math.max(+x || 1, SPEED_RANGE[0]), SPEED_RANGE[1]);
   }
 
-  /// The playing clock goes on from what is shown: images that were requested ahead are not rendered.
+  /// The playing clock continues from what is shown: images that were requested ahead are not rendered.
   #anchor() {
     if (!this.#playing) return;
     const { shown } = this.#schedule;
@@ -342,7 +343,7 @@ export class Splat4D extends THREE.Mesh {
     if (accepted) this.#onchange();
   }
 
-  /// Takes up the order that came last.
+  /// Applies the latest order.
   #turn() {
     const { order, count, generation } = this.#next,
       u = this.material.uniforms,
@@ -404,7 +405,7 @@ export class Splat4D extends THREE.Mesh {
     this.#retired.push({ ...page, generation: this.#order.generation });
   }
 
-  /// The texture of a uniform, marked as changed, with at least so many rows; the first `kept` numbers stay.
+  /// The texture of a uniform, marked as changed, with at least this many rows; the first `kept` numbers stay.
   #grown(name, make, rows, kept) {
     const u = this.material.uniforms[name],
       old = u.value;

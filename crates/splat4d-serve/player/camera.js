@@ -1,8 +1,8 @@
-// The viewer's camera: where it is, what it looks at, how wide it sees. World axes are the scene's own; camera axes are
+// The viewer's camera: position, target, field of view. World axes are the scene's own; camera axes are
 // OpenCV's (x right, y down, z forward), as everywhere in splat4d.
 
 export const DEGREE = Math.PI / 180;
-/** Nothing as near as this is drawn where cameras do not say, scene units. */
+/** Near plane where cameras do not state one, scene units. */
 export const NEAR = 0.01;
 /** Field of view where none is given: that of a normal lens. */
 const FOV_DEFAULT = 45;
@@ -95,7 +95,7 @@ export class Camera {
   up = [0, 1, 0];
   /** A dataset camera's exact lens ({width, height, fx, fy, cx, cy} px) until the viewer moves. */
   lens = null;
-  /** 1: a first view, which comes nearer in a tall window, until the viewer moves; 0: not; between, on the way to it. */
+  /** 1: a first view, which comes nearer in a tall window, until the viewer moves; 0: not; between, in transition. */
   first = 0;
 
   get right() { return quatTurn(this.quat, [1, 0, 0]); }
@@ -120,7 +120,7 @@ export class Camera {
     return this;
   }
 
-  /** Looks at the target with a stated up, which also may be rolled against the world's. */
+  /** Points at the target with a given up direction, which also may be rolled against the world's. */
   look(position, target, up = this.up) {
     const quat = lookRotation(position, target, up);
     return this.set({ position, quat, distance: norm(add(target, position, -1)) || this.distance });
@@ -131,7 +131,7 @@ export class Camera {
     const c = b.clone();
     if (u >= 1) return c;
     c.lens = null;
-    // The target moves straight, so that what is looked at stays in the image.
+    // The target moves straight, so that the target stays in the image.
     const target = mix(a.target, b.target, u);
     c.quat = slerp(a.quat, b.quat, u);
     c.distance = lerp(a.distance, b.distance, u);

@@ -4,7 +4,7 @@ import { DEGREE, FOV_RANGE, add, clamp, dot, quatAbout, quatMul } from './camera
 
 /** A drag across the window's shorter side turns half a circle. */
 const TURN_PER_SIDE = Math.PI;
-/** A pinch on a touch pad comes as a wheel with ctrl and small steps. */
+/** A pinch on a touch pad arrives as a wheel event with ctrl and small steps. */
 const PINCH = 5;
 /** Nearest to straight up or down, radians: beyond it left and right would change sides. */
 const POLE = 89 * DEGREE;
@@ -73,7 +73,7 @@ export class Controls {
       if (pan) this.#pan(dx, dy);
       else {
         const k = TURN_PER_SIDE / this.#side();
-        // With the mouse one looks around; under a finger the scene follows.
+        // The mouse turns the view; a finger moves the scene.
         const sign = this.mode === 'fly' && e.pointerType === 'touch' ? 1 : -1;
         this.turn(sign * dx * k, sign * dy * k);
         const now = performance.now(), dt = Math.max((now - this.#moved) / 1000, 1 / 240);

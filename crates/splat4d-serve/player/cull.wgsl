@@ -2,21 +2,21 @@
 // before the sort. Concatenated after resident.wgsl, project.wgsl and shade.wgsl.
 //
 //   cull            a workgroup owns a block of 256: tests the block, then each thread its Gaussian, if the page's key
-//                   masks admit it; what is visible becomes a record at its own place and a bit of the block's mask
+//                   masks admit it; what is visible becomes a record at its own index and a bit of the block's mask
 //   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
-//   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
+//   keys_of_depths  a workgroup owns a block again: 16-bit depth key and index of every record, without gaps
 //
 // Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the
-// lower place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
+// lower index is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
 // software devices, which are what tests run on, would take three times as long.
 
-// One picture; 160 bytes.
+// One image; 160 bytes.
 struct Frame {
     view: View,              // count: blocks in block_list
     background: vec3<f32>,
     channel: u32,            // CHANNEL_*
-    depth_range: vec2<f32>,  // near, far of the depth picture, scene units
-    flow_scale: f32,         // px/s that is drawn at full brightness
+    depth_range: vec2<f32>,  // near, far of the depth image, scene units
+    flow_scale: f32,         // px/s rendered at full brightness
     pad: u32,
 }
 
@@ -41,7 +41,7 @@ struct Range {
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> words: array<vec4<u32>>;        // two a Gaussian
+@group(0) @binding(1) var<storage, read> words: array<vec4<u32>>;        // two per Gaussian
 @group(0) @binding(2) var<storage, read> blocks: array<BlockHeader>;     // one a resident block
 @group(0) @binding(3) var<storage, read> block_list: array<u32>;         // the blocks of the pages at this time
 @group(0) @binding(4) var<storage, read> palette: array<u32>;            // a word a coefficient: bytes r, g, b
@@ -67,19 +67,19 @@ const CORNERS: u32 = 6u;
 const MASKS: u32 = 8u;
 // Pairs that a workgroup of sort.wgsl takes (SORT_BLOCK there).
 const PAIRS: u32 = 2048u;
-// Its scan takes a workgroup a digit, or one for all up to so many pairs (SORT_FEW blocks there).
+// Its scan takes a workgroup a digit, or one for all up to this many pairs (SORT_FEW blocks there).
 const SCAN_GROUPS: u32 = 256u;
 const FEW_PAIRS: u32 = 65536u;
 
 var<workgroup> group_sums: array<u32, 256>;
 
-// Whether nothing of the block can be seen. Errs on the side of drawing.
+// Whether nothing of the block is visible. When in doubt the block is rendered.
 fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
     let t = frame.view.time;
     if (t < header[2].x || t > header[2].y) {
         return true;
     }
-    // Within a life a mean strays by the shift; outside its centre's range, by the span at most.
+    // Within a lifespan a mean strays by the shift; outside its centre's range, by the span at most.
     let late = max(abs(t - header[1].z), abs(t - header[1].w));
     let stray = header[3].x * max(LIFE_REACHES, 2.0 * late / max(span, LEAST_SECONDS));
     let low = header[0].xyz;
@@ -91,8 +91,8 @@ fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
     if (p.z + reach.z <= frame.view.near) {
         return true;
     }
-    // A side of the picture, multiplied by z, is a plane; the ellipse widens it by SIGMAS |J| sigma_max and by the
-    // low-pass. |J| is bounded by its clamp to the picture and PROJECT_J_MARGIN.
+    // A side of the image, multiplied by z, is a plane; the ellipse widens it by SIGMAS |J| sigma_max and by the
+    // low-pass. |J| is bounded by its clamp to the image and PROJECT_J_MARGIN.
     let size = frame.view.size;
     let focal = frame.view.focal;
     let edge_low = frame.view.center;

@@ -1,4 +1,4 @@
-// From the stored bytes of a section to what a backend wants: checks the CRC, inflates, transposes byte planes into
+// From the stored bytes of a section to what a backend needs: checks the CRC, inflates, transposes byte planes into
 // words, and key masks into rows of bits.
 //
 // A classic script that is also a module, and so without imports and exports: a page opened from a disk may start
@@ -120,7 +120,7 @@ function mask(data, { count, from, to }) {
 ///
 /// `job`: {kind 'PAGE' | 'PALT' | 'MASK' | other: bytes as they are, stored Uint8Array, crc, codec, bytes, count,
 /// degree, labels: entries of the page's palette, 0: none, from, to}. Its sizes have been checked against the file.
-/// Throws an Error that says why.
+/// Throws an Error that states why.
 async function decode(job) {
   if (crc32(job.stored) !== job.crc) throw new Error('its bytes are damaged: the checksum differs');
   let data = job.stored;

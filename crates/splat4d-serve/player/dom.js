@@ -1,4 +1,4 @@
-// Small builders of page elements. Text goes in as text, never as markup: titles and names come out of foreign files.
+// Small builders of page elements. Text is inserted as text, never as markup: titles and names are from foreign files.
 
 import { icon } from './icons.js';
 
@@ -44,7 +44,7 @@ export const button = (label, onclick, props = {}, name = null) =>
   h('button', { type: 'button', class: 'soft', onclick, ...props }, name && icon(name), label);
 
 let groups = 0;
-/** A choice of one of a few: radio buttons that look like one control. set(value) shows a value. */
+/** A choice of one of a few: radio buttons shown as one control. set(value) shows a value. */
 export function segments(label, options, onpick, props = {}) {
   const name = `splat4d-${groups++}`;
   const inputs = new Map();
@@ -93,7 +93,7 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(href), 60000);
 }
 
-/** Asks for a file; nothing happens where the asked person changes their mind. */
+/** Opens the file dialog; nothing happens if it is cancelled. */
 export function pick(accept, onfile) {
   const input = h('input', { type: 'file', accept, onchange: () => input.files[0] && onfile(input.files[0]) });
   input.click();

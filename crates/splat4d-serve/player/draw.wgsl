@@ -1,9 +1,9 @@
-// The sorted ellipses as quads, farthest first, blended into a 16-bit float picture; then that picture onto the canvas.
+// The sorted ellipses as quads, farthest first, blended into a 16-bit float image; then that image onto the canvas.
 // Concatenated after resident.wgsl, project.wgsl, shade.wgsl and cull.wgsl, whose bindings 0, 5, 8 and 10 have
 // read-only twins here.
 
 @group(0) @binding(12) var<storage, read> drawn: array<Record>;
-@group(0) @binding(13) var<storage, read> order: array<u32>;      // places, nearest first
+@group(0) @binding(13) var<storage, read> order: array<u32>;      // indices, nearest first
 @group(0) @binding(14) var<storage, read> drawn_count: array<u32>; // `arguments` of cull.wgsl
 @group(0) @binding(15) var picture: texture_2d<f32>;
 
@@ -11,7 +11,7 @@
 const ALPHA_MAX: f32 = 0.99;
 // Which corner (bit 0 right, bit 1 lower) each vertex of a splat is, two bits a vertex: 0 1 2 2 1 3.
 const CORNER_BITS: u32 = 0xda4u;
-// Where among drawn_count the number of records is.
+// Index of the number of records in drawn_count.
 const COUNT: u32 = 3u;
 
 // Flat, and measured from the pixel's centre: what is interpolated carries the rounding of the corners to the raster's

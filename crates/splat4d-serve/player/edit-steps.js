@@ -1,4 +1,4 @@
-// Lists of edits as the page holds them: words, keys over time, undo and redo. Plain data, as edits.toml has it.
+// Lists of edits in the page: text, keys over time, undo and redo. Plain data, as edits.toml has it.
 
 import { DEGREE, lerp, quatAbout, quatNormal, slerp } from './camera.js';
 
@@ -19,7 +19,7 @@ export function turnOf(quat) {
 
 export const quatOf = turn => (turn ? quatAbout(turn, turn[3] * DEGREE) : [1, 0, 0, 0]);
 
-/** How far something is on its way: evenly, or slowly at the ends that ease (as the library has it). */
+/** Interpolation parameter: linear, or eased at the ends (as in the library). */
 function eased(u, a, b) {
   const [from, to] = [a ? 0 : 1, b ? 0 : 1];
   return u * (from + u * (3 - 2 * from - to + u * (from + to - 2)));
@@ -37,7 +37,7 @@ function around(keys, t) {
 const mix = (a, b, u) => a.map((x, i) => lerp(x, b[i], u));
 const placed = p => ({ shift: p.shift ?? [0, 0, 0], quat: quatOf(p.turn), scale: p.scale ?? 1 });
 
-/** Where a move has its things at t: {shift, quat, scale, about}. */
+/** The transform of a move at t: {shift, quat, scale, about}. */
 export function placeAt(step, t) {
   const about = (step.keys?.length ? step.about : step.to?.about) ?? [0, 0, 0];
   if (!step.keys?.length) return { ...placed(step.to ?? {}), about };
@@ -54,14 +54,14 @@ function words({ shift, quat, scale }) {
 
 const near = t => k => Math.abs(k.t - t) < SAME;
 
-/** Keys with one at t that says `value`; how it eases stays. */
+/** Keys with one at t that states `value`; how it eases stays. */
 function put(keys, t, value) {
   const old = keys.find(near(t));
   const key = { t: round(old?.t ?? t), ...value, ...(old?.ease && { ease: true }) };
   return [...keys.filter(k => k !== old), key].sort((a, b) => a.t - b.t);
 }
 
-/** A move whose things are there at t: by a key where it has keys, for good where it has none. */
+/** A move with a given transform at t: by a key if it has keys, otherwise at all times. */
 export function movedTo(step, t, place) {
   if (step.keys?.length) return { ...step, keys: put(step.keys, t, words(place)) };
   return { ...step, to: { ...words(place), about: rounded(place.about) } };
@@ -81,7 +81,7 @@ export function pulledAt(handle, t) {
   const [a, b, u] = around(handle.keys, t);
   return mix(a.by, b.by, u);
 }
-/** A handle that is pulled so at t: by a key where it has several, for good where it has one. */
+/** A handle that is pulled so at t: by a key if it has several, otherwise at all times. */
 export function pulledTo(handle, t, by) {
   const value = { by: rounded(by) };
   return { ...handle, keys: handle.keys.length > 1 ? put(handle.keys, t, value) : [{ ...handle.keys[0], ...value }] };
@@ -112,7 +112,7 @@ export function withKey(step, t) {
   return { ...rest, about: rounded(place.about), keys: put(step.keys ?? [], t, words(place)) };
 }
 
-/** The step with its keys changed by `f`, which takes and gives lists. A move or fade without any holds for good. */
+/** The step with its keys changed by `f`, from list to list. Without keys a move or fade applies at all times. */
 function rekeyed(step, f) {
   if (step.do === 'drag') {
     return { ...step, handles: step.handles.map(h => ({ ...h, keys: f(h.keys) })).filter(h => h.keys.length) };
@@ -131,7 +131,7 @@ export const easedKey = (step, t, ease) => rekeyed(step, keys => keys.map(k => {
   const { ease: old, ...rest } = k;
   return ease ? { ...rest, ease } : rest;
 }));
-/** A key elsewhere in time; one that is there already goes. */
+/** Moves a key in time, replacing one that is there. */
 export const shiftedKey = (step, from, to) => rekeyed(step, keys => {
   const moved = keys.find(near(from));
   if (!moved) return keys;

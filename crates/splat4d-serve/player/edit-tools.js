@@ -1,11 +1,11 @@
-// What is drawn over the image while one edits, and what hands do there: shapes, dots of what is selected, handles of a
+// Overlays of the image while editing, and their interaction: shapes, dots of what is selected, handles of a
 // move, nodes of a bend. Works on any backend: it is a canvas of its own.
 
 import { add, cross, normalize, quatAbout, quatMul, quatTurn } from './camera.js';
 
 /** Pixels: length of a move's arrows, of its rings' radius and of the distance to its scale handle, of a dot, of a node. */
 const ARROW = 84, RING = 62, KNOB = 56, DOT = 1.6, NODE = 3.2;
-/** How near a pointer must come, pixels: a mouse, a finger. */
+/** Distance of a pointer that counts as a hit, pixels: a mouse, a finger. */
 const NEAR = { mouse: 9, pen: 12, touch: 20 };
 /** A tap moves less than this, pixels. */
 const TAP = 5;

@@ -1,5 +1,5 @@
-// Editing: a panel over the player, and what it asks of the program that serves the page. The list of edits is the page's;
-// the program replays it, and only it knows how a scene is changed: nothing here touches a Gaussian.
+// Editing: a panel over the player, and its requests to the program that serves the page. The list of edits is the
+// page's; the program replays it, and only it can change a scene: nothing here touches a Gaussian.
 
 import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
   ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
@@ -82,7 +82,7 @@ const slider = (label, low, high, value, onchange, oninput) => {
 export class Editing {
   #timers = {};
   #run = 0;
-  /** Whether an image stands in, one is being made for another view, and one is wanted for yet another. */
+  /** Whether a substitute image is shown, one is being made for another view, and one is needed for yet another. */
   #standing = false;
   #looking = false;
   #again = false;
@@ -108,7 +108,7 @@ export class Editing {
     Object.assign(this, { ui, token, address, player: ui.player, history: new History([]) });
   }
 
-  // Asking.
+  // Requests.
 
   async ask(body) {
     this.#busy++;
@@ -125,7 +125,7 @@ export class Editing {
     }
   }
 
-  /** Whether nothing is asked for, and the scene is that of the list. */
+  /** Whether nothing is requested, and the scene is that of the list. */
   get idle() { return !this.#busy && !this.#standing && !this.overlay.shows; }
   get time() { return this.player.time; }
   get steps() { return this.history.steps; }
@@ -133,7 +133,7 @@ export class Editing {
   /** The steps before the one that is being set, or all: what selections are of. */
   get before() { return ready(this.active < 0 ? this.steps : this.steps.slice(0, this.active)); }
 
-  /** The player's view, as a camera of at most so many pixels a side. */
+  /** The player's view, as a camera of at most this many pixels per side. */
   view(side = SIDE) {
     const { clientWidth: w, clientHeight: height } = this.player.stage, k = Math.min(1, side / Math.max(w, height, 1));
     const [width, tall] = [w, height].map(x => Math.max(1, Math.round(x * k)));
@@ -450,7 +450,7 @@ export class Editing {
     this.refresh();
   }
 
-  /** Looks up who is selected, at this time. */
+  /** Requests the selected Gaussians, at this time. */
   async #select() {
     const run = ++this.#lookup, text = this.text.trim();
     if (!text) return this.#tell(null);
@@ -602,7 +602,7 @@ export class Editing {
     this.say(error.message, true);
   }
 
-  /** The program's own image of the list from here, which stands in until the scene is baked. */
+  /** The program's own image of the list from here, shown until the scene is baked. */
   async #look(steps, run) {
     const told = await this.ask({ do: 'show', steps, view: this.view(), t: this.time });
     if (run !== this.#run || !this.#standing) return;
@@ -611,7 +611,7 @@ export class Editing {
     this.refresh();
   }
 
-  /** The image that stands in goes along with camera and time. */
+  /** The preview image follows camera and time. */
   async #follow() {
     if (!this.#standing || this.overlay.busy) return;
     this.#again = true;
@@ -622,7 +622,7 @@ export class Editing {
         this.#again = false;
         await this.#look(ready(this.steps), this.#run);
       }
-    } catch { /* Who asked for the list hears of it. */ } finally { this.#looking = false; }
+    } catch { /* The caller that requested the list gets the error. */ } finally { this.#looking = false; }
   }
 
   async save() {
@@ -668,7 +668,7 @@ export class Editing {
     return round(GRIP * Math.sqrt(places.reduce((s, p) => s + p.reduce((q, x, k) => q + (x - middle[k]) ** 2, 0), 0) / places.length));
   }
 
-  /** Asks for the image of what is pulled; while one is on its way, only for the newest. */
+  /** Requests the image of what is pulled; while one is on its way, only for the newest. */
   async #pulling() {
     const bent = this.#bent, o = this.overlay;
     if (!bent) return;
@@ -681,7 +681,7 @@ export class Editing {
         const told = await this.ask({ do: 'pull', number: bent.number, handles, pins, view: this.view(SIDE_PULLING) });
         if (bent !== this.#bent || o.tool !== 'bend') return;
         o.nodes = told.nodes;
-        // After the hand has let go, the list's own image comes.
+        // After a handle is released, the list's own image is requested.
         if (o.busy || this.#standing) {
           if (o.busy) await o.show(told.picture);
         } else await o.show(null);
@@ -700,7 +700,7 @@ export class Editing {
     return { handles, pins: this.step.pins ?? [] };
   }
 
-  /** A handle was let go. */
+  /** A handle was released. */
   #pulled(node) {
     const step = this.step, { places } = this.#bent, one = this.overlay.pulled.find(p => p.node === node);
     const i = step.handles.findIndex(k => nearest(places, k.place) === node);
@@ -709,7 +709,7 @@ export class Editing {
     this.#set({ ...step, handles });
   }
 
-  /** A node was tapped: it is held, or let go. */
+  /** A node was tapped: it is pinned, or released. */
   #pin(node) {
     const step = this.step, { places } = this.#bent, pins = step.pins ?? [];
     const at = list => list.findIndex(k => nearest(places, k.place ?? k) === node);

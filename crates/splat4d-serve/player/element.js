@@ -24,7 +24,7 @@ function colour(text) {
   return digits?.map(x => parseInt(x + (x.length === 1 ? x : ''), 16) / 255) ?? null;
 }
 
-/** 'x,y,z tx,ty,tz [fov]': where the camera is, what it looks at, degrees. */
+/** 'x,y,z tx,ty,tz [fov]': where the camera is, its target, degrees. */
 function place(text) {
   const n = (text ?? '').split(/[\s,]+/).filter(Boolean).map(Number);
   if (![6, 7].includes(n.length) || n.some(x => !isFinite(x))) return undefined;
@@ -56,7 +56,7 @@ export class Splat4D extends HTMLElement {
     for (const name of EVENTS) {
       player.addEventListener(name, e => this.dispatchEvent(new CustomEvent(name, { detail: e.detail })));
     }
-    // What is wrong with the file for good is an error for the page as well; what only takes another try is not.
+    // Permanent faults of the file are errors for the page as well; temporary ones are not.
     player.addEventListener('trouble', ({ detail: { error, lasting } }) => {
       const { what, where, remedy } = error;
       if (lasting) this.dispatchEvent(new CustomEvent('error', { detail: { error, what, where, remedy } }));
@@ -72,7 +72,7 @@ export class Splat4D extends HTMLElement {
     }
     if (this.hasAttribute('page')) {
       addEventListener('hashchange', this.#hash);
-      // While the page still asks what to show. A failure is reported when there is a scene to render.
+      // While the page has not chosen a scene. A failure is reported when there is a scene to render.
       player.prepare().catch(() => {});
     }
     this.#load();
@@ -115,7 +115,7 @@ export class Splat4D extends HTMLElement {
     set[name]?.();
   }
 
-  /** Several attributes set in one go open the scene once. */
+  /** Several attributes set together open the scene once. */
   #load() {
     if (this.#queued) return;
     this.#queued = true;
@@ -130,7 +130,8 @@ export class Splat4D extends HTMLElement {
     const src = this.getAttribute('src');
     const source = this.#scene ?? (src ? new URL(src, document.baseURI).href : null);
     if (!source) {
-      // A page that sets the scene later must not flash a notice; an element whose markup is still being read is not empty either.
+      // A page that sets the scene later must not flash a notice; an element whose markup is still being read is not
+      // empty either.
       if (LOCAL.includes(location.hostname) && !this.hasAttribute('page')) ui.showNote('No scene: set the attribute src or the property scene.');
       return;
     }
@@ -142,7 +143,7 @@ export class Splat4D extends HTMLElement {
   /** Labels as colours, or one label alone: docs/player.md. */
   setLabels(show) { this.#player?.setLabels(show); }
 
-  /** How a scene begins: the attributes say, and a page's address says more. */
+  /** How a scene begins: the attributes say, and a page's address states more. */
   #start() {
     const time = this.getAttribute('time');
     return {
@@ -189,7 +190,7 @@ export class Splat4D extends HTMLElement {
   /** The deep link's part behind '#'. */
   get link() { return this.#player?.link(); }
 
-  /** Asks for a file, where there is nothing to show. */
+  /** Opens the file dialog if there is nothing to show. */
   invite() { this.#ui.showEmpty(); }
 
   /** Follows a training run: {events, src, metrics} addresses; `version` of the scene that is there already. */

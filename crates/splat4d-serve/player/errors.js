@@ -8,7 +8,7 @@ export class SceneError extends Error {
   }
 }
 
-/// Whether `error` only says that the result is no longer wanted.
+/// Whether `error` only states that the result is no longer requested.
 export function isAbort(error) {
   return error?.name === 'AbortError';
 }

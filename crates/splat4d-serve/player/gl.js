@@ -83,9 +83,9 @@ export function check(gl, what) {
   }
 }
 
-/// Measures how long the graphics processor works on what lies between `begin` and `end`, where the browser reports it.
+/// Measures how long the graphics processor works between `begin` and `end`, where the browser reports it.
 export class Timer {
-  /// The latest answer, ms; 0 where there is none.
+  /// The latest result, ms; 0 where there is none.
   ms = 0;
   #gl;
   #extension;
@@ -99,7 +99,7 @@ export class Timer {
     const gl = this.#gl;
     if (!this.#extension) return;
     if (this.#query) {
-      // One at a time: answers come frames later.
+      // One at a time: results arrive frames later.
       if (!gl.getQueryParameter(this.#query, gl.QUERY_RESULT_AVAILABLE)) return;
       const valid = !gl.getParameter(this.#extension.GPU_DISJOINT_EXT);
       if (valid) this.ms = gl.getQueryParameter(this.#query, gl.QUERY_RESULT) / 1e6;

@@ -170,7 +170,7 @@ void main() {
   tint = s.tint.rgb;
   vec2 axis = s.place.zw, side = vec2((corner & 1) * 2 - 1, (corner >> 1) * 2 - 1);
   vec2 at = middle + side.x * axis + side.y * s.tint.w * vec2(-axis.y, axis.x);
-  // Rows go from the top in this target; the way to the canvas turns them.
+  // Rows run from the top in this target; the copy to the canvas flips them.
   gl_Position = vec4(at / size * 2.0 - 1.0, 0, 1);
   if (axis == vec2(0)) gl_Position = vec4(2, 2, 0, 1);
 }`;
@@ -227,7 +227,7 @@ export const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 uniform highp sampler2D sums;
 uniform vec3 background;
-// 1, or 0 where what lies behind is not ours to draw.
+// 1, or 0 where the background is not rendered here.
 uniform float opaque;
 uniform ivec2 origin;
 // Height of the image where rows must be turned round, else 0.

@@ -1,5 +1,5 @@
-// What Gaussians are part of (docs/format.md, "Labels"), shown as colours, or one label alone: pages are changed on their way
-// to the backend, which knows nothing of labels.
+// Labels of Gaussians (docs/format.md, "Labels") as colours, or one label alone: pages are changed on
+// their way to the backend, which does not handle labels.
 
 /// 32-bit words a Gaussian, Gaussians a block, f32 numbers of its header (docs/format.md).
 const WORDS = 8,
@@ -7,7 +7,7 @@ const WORDS = 8,
   HEADER = 24;
 /// The byte of a Gaussian without a label.
 const NONE = 255;
-/// Turn of the hue from one label to the next: the golden section, as `splat4d render --channel label` has it.
+/// Turn of the hue from one label to the next: the golden section, as in `splat4d render --channel label`.
 const GOLDEN = 0.618034;
 const GREY = 0x808080;
 
@@ -29,8 +29,8 @@ export function labelCss(label) {
   return `rgb(${c & 255} ${(c >> 8) & 255} ${c >> 16})`;
 }
 
-/// A page and its entry as they are to be shown. `labels`: a byte a Gaussian, or null: none has one. `show`: {colors: each
-/// label in its colour, only: the number of the label that alone is seen, or null}.
+/// A page and its entry as they are to be shown. `labels`: a byte per Gaussian, or null: none has one. `show`: {colors:
+/// each label in its colour, only: the number of the label that alone is seen, or null}.
 export function painted(page, entry, labels, show) {
   const words = page.words.slice();
   const headers = show.colors ? page.headers.slice() : page.headers;

@@ -9,7 +9,7 @@ const RETRY = [500, 8000];
 const TOGETHER = 30;
 /** In place of the figures before the first step: a large capture is read for minutes. */
 const FIRST = 'The capture is read and the first Gaussians are placed. The render appears with the first snapshot.';
-/** Points of the curve that are kept; beyond it every second one goes. */
+/** Points of the curve that are kept; beyond it every second one is dropped. */
 const CURVE_MAX = 2000;
 
 /** Follows `events`; `handlers`: {step(data), snapshot(version), state('connecting' | 'live' | 'away')}. */
@@ -30,7 +30,7 @@ export class Feed {
     source.onopen = () => { this.#wait = RETRY[0]; this.handlers.state('live'); };
     source.onmessage = e => this.#message(e.data);
     source.onerror = () => {
-      // A browser tries again by itself only after some kinds of failure, so that it is done here after all of them.
+      // A browser retries on its own only after some kinds of failure, so that it is done here after all of them.
       source.close();
       this.handlers.state('away');
       this.#timer = setTimeout(() => this.#connect(), this.#wait);
@@ -123,7 +123,7 @@ export class Training {
       snapshot: show,
       state: state => {
         this.#show(state);
-        // A page that joins late or was disconnected asks for what it missed.
+        // A page that joins late or was disconnected requests what it missed.
         if (state === 'live') past();
       },
       other: data => {
@@ -133,7 +133,7 @@ export class Training {
     });
   }
 
-  /** Asks the program to pause, continue or stop. */
+  /** Requests the program to pause, continue or stop. */
   async #ask(what) {
     try {
       const answer = await fetch(this.control.address, { method: 'POST', body: JSON.stringify({ do: what }),
@@ -169,7 +169,7 @@ export class Training {
     if (!this.last && !over) this.figures.replaceChildren(h('small', { class: 'wait' }, FIRST));
   }
 
-  /** The server may end with the run: the page keeps the scene, and asks for nothing more. */
+  /** The server may end with the run: the page keeps the scene, and requests nothing more. */
   async #finish() {
     if (this.over) return;
     this.over = true;

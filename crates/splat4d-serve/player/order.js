@@ -7,7 +7,7 @@ const { Sorter } = globalThis.splat4dSort;
 
 /// One order is on its way at a time. schedule.js decides which one is requested and when.
 export class Order {
-  /// Counts pages that came and went, and masks; an order carries the number it was computed with.
+  /// Counts added and dropped pages, and masks; an order carries the number it was computed with.
   generation = 0;
   /// Whether an order is on its way.
   busy = false;
@@ -15,13 +15,13 @@ export class Order {
   #near;
   #worker = null;
   #sorter = null;
-  /// [message, what moves with it], until the worker says that it runs: a page's policy may forbid workers.
+  /// [message, what moves with it], until the worker states that it runs: a page's policy may forbid workers.
   #early = [];
   /// The array that is passed back and forth.
   #array = null;
 
-  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible at
-  /// the requested time, the farthest first; it is valid during the call only.
+  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible
+  /// at the requested time, the farthest first; it is valid during the call only.
   constructor(near, onorder) {
     this.#near = near;
     this.#onorder = onorder;
@@ -94,7 +94,7 @@ export class Order {
     const array = this.#sorter.room(order);
     const { count, active } = this.#sorter.sort(sort, array);
     const ms = performance.now() - begin;
-    // Later, as a worker's result would come: the caller has finished its own work then.
+    // Later, like a worker's result: the caller has finished its own work then.
     setTimeout(() => this.#arrived({ order: array, count, active, ms, generation }), 0);
   }
 

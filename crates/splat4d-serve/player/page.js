@@ -7,7 +7,7 @@ async function config() {
   if (globalThis.SPLAT4D_CONFIG) return globalThis.SPLAT4D_CONFIG;
   const inline = document.getElementById('splat4d-config');
   if (inline) return JSON.parse(inline.textContent);
-  // A page opened from a disk has no server to ask.
+  // A page opened from a disk has no server.
   if (!location.protocol.startsWith('http')) return {};
   try {
     const answer = await fetch('./config.json');
@@ -34,7 +34,7 @@ element.setAttribute('page', '');
 document.body.append(element);
 const { scene, src = scene, title, live, metrics, version, cameras, photos, frusta, autoplay = true } = about;
 if (cameras) element.face.capture = { cameras, photos: photos ? './photo' : null, overview: frusta };
-// A capture is first looked at as it stands.
+// A capture is first shown unchanged.
 if (autoplay && !token && !frusta && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
 if (title) {
   element.setAttribute('heading', title);

@@ -185,7 +185,7 @@ export function figuresCard(player) {
   return node;
 }
 
-/** Reads a path file; the message says what is wrong with it. */
+/** Reads a path file; the message states what is wrong with it. */
 export async function readPath(file, camera) {
   return Track.parse(await file.text(), camera);
 }

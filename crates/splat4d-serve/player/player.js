@@ -33,15 +33,15 @@ const GLIDE = 0.5;
 const REST = 150, AT_ONCE = 1000, FIRST_STEP = 400, NEXT_STEP = 300;
 /** What changed: only what is shown, or that something moves as well, which then counts as not at rest. */
 const CONTENT = 1, MOTION = 2;
-/** Stands for a clock that waits for pages: no other time can be rendered. */
+/** Marks a clock that waits for pages: no other time can be rendered. */
 const HOLD = () => null;
 /** A move of half the image's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
-/** Beyond this share of the way to what is looked at nothing is cut off. */
+/** Beyond this share of the distance to the target nothing is cut off. */
 const NEAR_SHARE = 0.2;
 /** A device that is lost more often than this within a minute is given up. */
 const LOSSES = 3;
-/** Points of the clip at which the buffer bar asks what is there, and how often, ms. */
+/** Points of the clip that the buffer bar samples, and the interval, ms. */
 const BUFFER_POINTS = 100;
 const BUFFER_EVERY = 250;
 
@@ -55,7 +55,7 @@ export class Player extends EventTarget {
   /** Where the clock is, s; the image follows it (`time`). */
   clock = 0;
   playing = false;
-  /** The clock stands because pages of its time are missing. */
+  /** The clock waits because pages of its time are missing. */
   waiting = false;
   loop = true;
   meta = null;
@@ -116,7 +116,7 @@ export class Player extends EventTarget {
     this.resizes.observe(stage);
     this.sight = new IntersectionObserver(list => { this.#seen = list.at(-1).isIntersecting; this.redraw(); });
     this.sight.observe(stage);
-    // Frames that a hidden tab left out were not slow, and its clock stood.
+    // Frames that a hidden tab left out were not slow, and its clock was stopped.
     this.sleeps = () => { this.#interval = this.#last = 0; };
     document.addEventListener('visibilitychange', this.sleeps);
     const loop = now => { this.#frame = requestAnimationFrame(loop); this.#tick(now); };
@@ -141,13 +141,13 @@ export class Player extends EventTarget {
 
   /** The second that the newest image shows; before the first one, where the clock is. */
   get time() { return this.backend?.shown?.time ?? this.#stillTime ?? Math.min(this.clock, this.last); }
-  /** Whether the image of a jump of the clock is still to come. */
+  /** Whether the image of a jump of the clock is pending. */
   get seeking() { return !!this.backend?.shown && this.backend.shown.epoch !== this.#epoch; }
 
-  /** Where the image is or will be next: what a step or a slider goes on from. */
+  /** Where the image is or will be next: where a step or a slider continues. */
   get target() { return this.seeking ? this.clock : this.time; }
 
-  /** Renders again, as something that moves; `what` CONTENT: as it is. */
+  /** Renders again, as something that moves; `what` CONTENT: static. */
   redraw(what = MOTION) { this.#dirty = Math.max(this.#dirty, what); }
 
   // Loading.
@@ -224,7 +224,7 @@ export class Player extends EventTarget {
   /** Gives the scene to the backend, at first and after a lost device. */
   #attach() {
     this.backend.setScene(this.meta);
-    // Phones end pages that take more than some hundred MB, and not all of them say what they have.
+    // Phones end pages that take more than some hundred MB, and not all of them report their memory.
     const budget = matchMedia('(pointer: coarse)').matches ? { budget: 2 ** 27 } : {};
     this.#stream = new Stream(this.file, this.backend, {
       ...budget,
@@ -260,7 +260,7 @@ export class Player extends EventTarget {
 
   #pageFailed(error) {
     if (error.name === 'AbortError') return;
-    // What is resident goes on playing; only a scene of which nothing can be shown becomes an error page.
+    // What is resident continues playing; only a scene of which nothing can be shown becomes an error page.
     if (this.state === 'ready') this.emit('trouble', { error });
     else this.fail(error);
   }
@@ -331,7 +331,7 @@ export class Player extends EventTarget {
         this.#newCanvas();
       }
     }
-    throw new SceneError('This browser cannot render the scene', reasons.join('; '),
+    throw new SceneError('This browser cannot render the scene', [...new Set(reasons)].join('; '),
       'Turn on hardware acceleration in its settings, or open the page in a current Chrome, Edge, Firefox or Safari.');
   }
 
@@ -383,7 +383,7 @@ export class Player extends EventTarget {
     this.emit('pause');
   }
 
-  /** The clock goes on from what is shown, if it goes on: images that were requested ahead are not rendered. */
+  /** A running clock continues from what is shown: images that were requested ahead are not rendered. */
   #stop() {
     if (!this.playing && !this.film) return;
     if (!this.seeking) this.clock = this.time;
@@ -484,7 +484,7 @@ export class Player extends EventTarget {
     this.emit('mode');
   }
 
-  /** Plays the path; frozen, time stands still meanwhile (bullet time), on a turn about the target if there is none. */
+  /** Plays the path; frozen, time is stopped meanwhile (bullet time), on a turn about the target if there is none. */
   playFilm({ frozen = false } = {}) {
     if (!this.file) return;
     const track = this.track.keys.length > 1 ? this.track : frozen ? Track.turn(this.camera) : null;
@@ -565,7 +565,7 @@ export class Player extends EventTarget {
 
   get #clip() { return { first: this.first, last: this.last, frameTime: this.frameTime, loop: this.loop }; }
 
-  /** Whether the clock runs, by itself or along a path. */
+  /** Whether the clock runs, freely or along a path. */
   get #running() { return this.state === 'ready' && (this.playing || (!!this.film && !this.film.frozen)); }
 
   /** Where the clock will be at `ms` of performance.now(); null where no image of that can be rendered yet. */
@@ -606,7 +606,7 @@ export class Player extends EventTarget {
     if (!moving) this.#interval = 0;
   }
 
-  /** Share of the screen's pixels for an image that stands still. */
+  /** Share of the screen's pixels for a static image. */
   #restScale(now) {
     const { scale } = this;
     if (this.resolution !== 'auto') return scale;
@@ -639,7 +639,7 @@ export class Player extends EventTarget {
       return false;
     }
     this.#drawnAt = performance.now();
-    // The image of the previous scene goes with the first one of the next.
+    // The image of the previous scene is removed with the first one of the next.
     if (!force) {
       this.#still?.remove();
       this.#stillTime = null;
@@ -657,7 +657,7 @@ export class Player extends EventTarget {
 
   /** What a backend is to render now, at a size in px. */
   drawing(width, height, camera = this.camera) {
-    // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
+    // The capture's cameras saw no haze right before them. A viewer who moves closer must see it.
     const least = this.meta.near ?? NEAR;
     const near = camera.lens ? least : Math.min(least, NEAR_SHARE * camera.distance);
     // While pages are missing, what is shown stays, seen by the newest camera.
@@ -709,7 +709,7 @@ export class Player extends EventTarget {
     this.buffered = out;
   }
 
-  // What others ask for.
+  // What others may call.
 
   /** A PNG of the image, as shown but always at full resolution; its `time` is the second that it shows. */
   async screenshot() {
@@ -769,7 +769,7 @@ export class Player extends EventTarget {
   }
 }
 
-/** Whether WebGL says that it is computed on the CPU. */
+/** Whether WebGL states that it is computed on the CPU. */
 function software(gl) {
   const asked = gl?.getExtension?.('WEBGL_debug_renderer_info');
   return !!asked && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(asked.UNMASKED_RENDERER_WEBGL));

@@ -5,7 +5,7 @@ import { SceneError } from './errors.js';
 
 /// Requests at a time: what browsers open to one host over HTTP/1.1.
 const PARALLEL = 6;
-/// Longest request that is put together from several sections, bytes: longer ones would keep what is wanted first
+/// Longest request that is put together from several sections, bytes: longer ones would keep what is needed first
 /// waiting on one connection while others idle.
 const RUN = 1 << 20;
 /// Unwanted bytes between two sections that cost less than a request of their own.
@@ -44,7 +44,7 @@ export class Local {
   close() {}
 }
 
-/// A URL. `open` makes the first request and learns whether the server knows ranges.
+/// A URL. `open` makes the first request and detects whether the server supports ranges.
 export class Remote {
   bytesRead = 0;
   /// Length of the whole, bytes; Infinity where the server hides it (Content-Range is not shown across origins).
@@ -106,7 +106,7 @@ export class Remote {
       };
       signal?.addEventListener('abort', job.leave, { once: true });
       this.#queue.push(job);
-      // In a microtask, so that what is asked for in one go can share a request.
+      // In a microtask, so that ranges requested together can share a request.
       queueMicrotask(() => this.#next());
     });
   }
@@ -140,7 +140,7 @@ export class Remote {
     }
   }
 
-  /// Fetches jobs that lie behind one another, in one request; each is answered as soon as its bytes are there.
+  /// Fetches jobs that lie behind one another, in one request; each resolves as soon as its bytes arrived.
   async #fetch(run) {
     const stop = new AbortController();
     const leave = () => stop.abort();

@@ -72,7 +72,7 @@ export class Rig {
     this.redraw();
   }
 
-  /** Looks at scene and cameras from behind the cameras, unless the page's address says from where. */
+  /** Shows scene and cameras from behind the cameras, unless the page's address states a position. */
   #overview() {
     if (!this.poses.length || readLink(location.hash).camera) return;
     const { center, radius } = bounds(this.player.meta), { up } = this.player.camera, n = this.poses.length;
@@ -149,7 +149,7 @@ export class Rig {
     }
   }
 
-  /** A click on a camera shows what it sees. */
+  /** A click on a camera shows its view. */
   #pick(e) {
     const box = this.player.stage.getBoundingClientRect(), at = [e.clientX - box.left, e.clientY - box.top];
     const away = p => Math.hypot(p.at[0] - at[0], p.at[1] - at[1]);
@@ -169,7 +169,7 @@ export class Rig {
     this.#timer = setTimeout(() => this.#images(), REST);
   }
 
-  /** One after the other: the server works on two things at a time. */
+  /** One after the other: the server handles two requests at a time. */
   async #images() {
     if (!this.photos) return;
     const asked = this.#asked = {}, stride = Math.ceil(this.cameras.length / MOST_IMAGES);

@@ -17,7 +17,7 @@ const HEAD = 64,
   BLOCK_BYTES = 96,
   WORDS = 8;
 const MAGIC = [0x89, 0x53, 0x34, 0x44, 0x0d, 0x0a, 0x1a, 0x0a];
-/// A finished file, and one that grows: its index lies behind what it lists.
+/// A finished file, and one that grows: its index is behind the listed sections.
 const MAJOR = 1,
   GROWING = 2;
 const MAX_INDEX = 64 << 20,
@@ -96,7 +96,7 @@ class Decoder {
     }
   }
 
-  /// A worker that did not start (a page's policy may forbid it): what it was given is done here.
+  /// A worker that did not start (a page's policy may forbid it): its work is done here.
   #fall(lane) {
     this.#here = true;
     for (const [ticket, w] of [...this.#waiting]) {
@@ -148,14 +148,14 @@ export class SceneFile {
   #head;
   #decoder = new Decoder();
 
-  /// Bytes that came from the network or the disk.
+  /// Bytes from the network or the disk.
   get bytesRead() {
     return this.#source.bytesRead;
   }
 
   /// Length of the file, bytes.
   bytesTotal = 0;
-  /// Bytes that the file says it has: more than there are where it was cut short.
+  /// Bytes that the file states it has: more than there are where it was cut short.
   length = 0;
 
   /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count),
@@ -324,7 +324,7 @@ export class SceneFile {
       if (page.labels !== -1) this.#refuse(`Page ${page.id} has labels twice`);
       if (!labels.missing) page.labels = labels.id;
     }
-    // What the pages state is what will be drawn, whatever the description says.
+    // The pages determine what is rendered, not the description.
     this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
   }
 

@@ -1,6 +1,6 @@
-// Which time of the scene is rendered when. An order and its alive set hold for one time only, and a worker computes them
-// while the clock runs on. Therefore a frame is rendered at the time of its order, and the next order is requested ahead
-// of the clock by the measured latency. Pure logic: nothing here touches a browser.
+// Which time of the scene is rendered when. An order and its alive set hold for one time only, and a worker computes
+// them while the clock runs on. Therefore a frame is rendered at the time of its order, and the next order is requested
+// ahead of the clock by the measured latency. Pure logic: nothing here touches a browser.
 
 /// Latency before anything is measured, ms: one frame of a 60 Hz screen.
 const FIRST_LATENCY = 1000 / 60;
@@ -28,7 +28,7 @@ export function advance(time, step, { first, last, frameTime, loop }) {
 
 const modulo = (x, n) => ((x % n) + n) % n;
 
-/// Requests orders from an `Order` and says which of them are rendered.
+/// Requests orders from an `Order` and states which of them are rendered.
 export class Schedule {
   /// The newest order that is to be rendered: {time, epoch, view}; null before the first one of a scene.
   current = null;
@@ -53,8 +53,9 @@ export class Schedule {
     this.#order = order;
   }
 
-  /// What is to be shown: `time` now; `at(ms)`, where a clock runs, the time at a later `performance.now()`, null where that
-  /// cannot be rendered yet; `epoch` counts jumps of the clock; `view` the camera, `cameraFromWorld` its 3x4 matrix.
+  /// What is to be shown: `time` now; `at(ms)`, where a clock runs, the time at a later `performance.now()`, null where
+  /// that cannot be rendered yet; `epoch` counts jumps of the clock; `view` the camera, `cameraFromWorld` its 3x4
+  /// matrix.
   want(wanted, now) {
     if (wanted.epoch !== this.#wanted?.epoch) this.#due = -Infinity;
     this.#wanted = wanted;
@@ -72,7 +73,7 @@ export class Schedule {
     const { at, epoch, view } = wanted;
     let { time } = wanted;
     if (at) {
-      // One that has come is rendered first; where sorting takes longer than a frame, the next is computed meanwhile.
+      // A finished one is rendered first; where sorting takes longer than a frame, the next is computed meanwhile.
       if (this.fresh && !(this.current.took > this.#interval)) return false;
       // Never back: a latency that shrinks slows the clock down until they agree.
       this.#due = Math.max(this.#due + CATCH_UP * (now - this.#askedAt), now + this.latency);
@@ -94,16 +95,16 @@ export class Schedule {
     return true;
   }
 
-  /// An order that was requested ahead of a clock which jumped or stopped meanwhile is not rendered; but never two in a row,
-  /// so that a clock that keeps jumping is followed.
+  /// An order that was requested ahead of a clock which jumped or stopped meanwhile is not rendered; but never two in a
+  /// row, so that a clock that keeps jumping is followed.
   #skips({ ahead, epoch }) {
     if (!ahead || epoch === this.#wanted?.epoch || this.#skipped) return false;
     this.#skipped = true;
     return true;
   }
 
-  /// An order came. Returns whether it is `current`, and rendered next. What the newest image was rendered from must be kept
-  /// until then: `want` may return to it.
+  /// An order arrived. Returns whether it is `current`, and rendered next. What the newest image was rendered from must
+  /// be kept until then: `want` may return to it.
   arrived(now) {
     const asked = this.#asked;
     if (asked.generation < this.#least || this.#skips(asked)) return false;
@@ -177,7 +178,7 @@ export class Follower {
     this.#now = now;
   }
 
-  /// The function that gives the clock's time at a later `performance.now()`; null where it stands still.
+  /// The function that gives the clock's time at a later `performance.now()`; null where it is stopped.
   at([first, last]) {
     if (!this.#rate) return null;
     return (ms) => {
@@ -189,7 +190,8 @@ export class Follower {
   }
 }
 
-/// A clock that was not set for so long stands still, s; after a longer gap it has jumped, s; so does a faster one.
+/// A clock that was not set for this long counts as stopped, s; after a longer gap it has jumped, s; so does a faster
+/// one.
 const STILL = 0.05,
   PAUSE = 1,
   RATE_MAX = 8;

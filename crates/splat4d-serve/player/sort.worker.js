@@ -26,8 +26,8 @@ const REACH_TAILS = 3;
 const signed10 = (word, bit) => (((word >>> bit) & 1023) - 511) / 511;
 const lerp = (a, b, u) => a + (b - a) * u;
 
-/// Motion and life of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the life's centre (3), that
-/// centre, velocity (3), half-width, softness, opacity, reach.
+/// Motion and lifespan of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the lifespan's centre
+/// (3), that centre, velocity (3), half-width, softness, opacity, reach.
 function path(words, headers, i, span, out) {
   const w = WORDS * i,
     f = HEADER * Math.floor(i / BLOCK),
@@ -86,7 +86,7 @@ class KeyMask {
     return this.#mask.keys[k];
   }
 
-  /// Takes up the bits of time `t`; says whether they are others now.
+  /// Takes up the bits of time `t`; states whether they are others now.
   at(t) {
     const { rows, stride } = this.#mask,
       [l, r] = this.around(t);
@@ -156,7 +156,7 @@ class Sorter {
     if (page) page.mask = new KeyMask(mask);
   }
 
-  /// `order` where it has room for all, else a new one: whole rows of ROW numbers.
+  /// `order` if it is large enough, else a new one: whole rows of ROW numbers.
   room(order) {
     const rows = Math.ceil(this.total / ROW);
     return order?.length >= rows * ROW ? order : new Uint32Array(rows * ROW);
@@ -231,7 +231,7 @@ class Sorter {
       starts[key] = sum;
       sum += here;
     }
-    // Front to back equal depths go by number, so back to front they go backwards.
+    // Equal depths are ordered by number front to back, so reversed back to front.
     for (let i = n - 1; i >= 0; i--) out[starts[keys[i]]++] = ids[i];
     return { count: n, active };
   }

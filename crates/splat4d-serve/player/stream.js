@@ -1,5 +1,5 @@
 // Keeps the right pages in a backend: first those of this time (most important tier first), then those just ahead;
-// above its budget it lets go of what is farthest in time, never of what this time needs.
+// above its budget it drops the pages farthest in time, never of what this time needs.
 
 import { isAbort } from './errors.js';
 import { painted } from './labels.js';
@@ -8,7 +8,7 @@ import { painted } from './labels.js';
 const BUDGET = 512 << 20,
   SMALL_BUDGET = 128 << 20,
   SMALL_MEMORY = 4;
-/// Bytes a Gaussian (docs/format.md: 8 words).
+/// Bytes per Gaussian (docs/format.md: 8 words).
 const GAUSSIAN = 32;
 /// Bytes that a page and its key masks take.
 const cost = (page) => page.count * GAUSSIAN + (page.maskBytes ?? 0);
@@ -61,14 +61,14 @@ export class Stream {
   #over = false;
   #starts;
   #ends;
-  /// Pages of the coarsest tier of their span, and those of now that the budget has no room for.
+  /// Pages of the coarsest tier of their span, and those of now that exceed the budget.
   #coarse;
   #leftOut = new Set();
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
-  /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
-  /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` wants it, null:
-  /// pages are shown as they are.
+  /// `onchange()` after each page that was added or dropped, `onerror(SceneError)` for a page that is given up for now,
+  /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` needs it, null:
+  /// pages are shown unchanged.
   constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
     this.#show = show;
     this.#file = file;
@@ -92,7 +92,7 @@ export class Stream {
     return this.#bytes;
   }
 
-  /// Gaussians of this time that the budget has no room for: those of the last tiers.
+  /// Gaussians of this time that exceed the budget: those of the last tiers.
   left = 0;
 
   /// Pages on their way.
@@ -110,7 +110,7 @@ export class Stream {
       [this.#begun, this.#ended, this.#active] = [begun, ended, this.#file.activePages(t)];
     }
     const active = this.#active;
-    // What lies ahead is looked at again in coarse steps only.
+    // Later times are examined again in coarse steps only.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const step = Math.floor((t / reach) * STEP);
     const last = this.#last;
@@ -134,8 +134,8 @@ export class Stream {
     return all ? there / all : 1;
   }
 
-  /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the budget
-  /// has no room for it.
+  /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the
+  /// budget does not allow it.
   playable(time) {
     return this.#pagesOf(time).every(({ id }) => {
       if (!this.#coarse.has(id) || this.#resident.has(id) || this.#leftOut.has(id)) return true;
@@ -166,7 +166,7 @@ export class Stream {
     for (const done of this.#waiting.splice(0)) done();
   }
 
-  /// Decides what should be resident: `#now` and `#later`, both in the order in which they are wanted, within budget.
+  /// Decides what should be resident: `#now` and `#later`, both in the order in which they are needed, within budget.
   #plan(t, playing, speed, loop, reach) {
     const [first, last] = this.#file.meta.clip;
     const now = [],
@@ -204,7 +204,7 @@ export class Stream {
     this.#shrink(wanted);
   }
 
-  /// Drops pages until what is wanted fits: the farthest in time first.
+  /// Drops pages until what is needed fits: the farthest in time first.
   #shrink(wanted) {
     let missing = 0;
     for (const page of [...this.#now, ...this.#later]) {
@@ -214,7 +214,7 @@ export class Stream {
     const { time, playing, speed } = this.#last;
     const far = (page) => {
       const gap = page.from > time ? page.from - time : Math.max(time - page.to, 0);
-      // While it plays, what has just passed is needed later than what comes.
+      // While it plays, past pages are needed later than coming ones.
       const passed = playing && (speed >= 0 ? page.to <= time : page.from > time);
       return passed ? gap + AHEAD : gap;
     };
@@ -254,7 +254,7 @@ export class Stream {
     this.#wake();
   }
 
-  /// The page, unless it is there, and its mask, which is asked for at the same time: both lie together in the file.
+  /// The page, unless it is there, and its mask, which is requested at the same time: both lie together in the file.
   /// Until the mask is there, the page is drawn without it.
   async #load(entry) {
     const stop = new AbortController(),
@@ -314,7 +314,7 @@ export class Stream {
     return there;
   }
 
-  /// Answers `settled` where nothing of this time is on its way any more.
+  /// Resolves `settled` when nothing of this time is being loaded.
   #wake() {
     if (!this.#waiting.length) return;
     if (this.#now.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;

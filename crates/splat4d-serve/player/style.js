@@ -1,4 +1,4 @@
-// The look: calm surfaces over the image, one accent colour. Sizes are in em of one font size that grows with the
+// Style: calm surfaces over the image, one accent colour. Sizes are in em of one font size that grows with the
 // player, so that it is legible from 360 px to 4K. No blur: it would be paid for on every frame without a GPU.
 
 const DARK = `--page:#0d0f12;--surface:rgba(20,23,28,.96);--raised:rgba(255,255,255,.07);--press:rgba(255,255,255,.13);

@@ -22,7 +22,8 @@ const CORNERS = [0, 1, 2, 2, 1, 3];
 /// Indices of the quads of one instance.
 export const corners = () => Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + CORNERS[i % 6]);
 
-/// A page's block headers as `rows` rows of texels. `palette` {row, degree, ranges}: where its palette lies, if it has one.
+/// A page's block headers as `rows` rows of texels. `palette` {row, degree, ranges}: position of its palette, if it has
+/// one.
 export function blockTexels(headers, rows, { from, to }, palette, start) {
   const texels = new Float32Array(rows * BLOCKS_WIDTH * 4);
   const { row, degree, ranges } = palette ?? { row: -1, degree: 0, ranges: [0, 0, 0] };
@@ -37,7 +38,8 @@ export function blockTexels(headers, rows, { from, to }, palette, start) {
   return texels;
 }
 
-/// A palette from planes (coefficient, channel) to `rows` rows of texels: one coefficient of an entry each, entry by entry.
+/// A palette from planes (coefficient, channel) to `rows` rows of texels: one coefficient of an entry each, entry by
+/// entry.
 export function paletteTexels(per, count, bytes, rows) {
   const texels = new Uint8Array(rows * WIDTH * 4);
   for (let k = 0; k < per; k++) {

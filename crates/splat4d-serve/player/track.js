@@ -4,7 +4,7 @@
 import { Camera, add, clamp, lerp, norm, quatFromRows, quatMul, quatAbout, slerp, vector } from './camera.js';
 
 const KEYS = ['time', 'scene_time', 'position', 'look_at', 'up', 'fov_y', 'world_to_camera'];
-/** Seconds of film between two keys whose scene times do not say. */
+/** Seconds of film between two keys without scene times. */
 const GAP = 2;
 /** Seconds of the turn about the target that bullet time makes where no path is set. */
 const TURN = 8;
@@ -81,7 +81,7 @@ export class Track {
     };
   }
 
-  /** From the JSON of a path file; throws an Error whose message names the key and the trouble. */
+  /** From the JSON of a path file; throws an Error whose message names the key and the error. */
   static parse(text, likeness) {
     let value;
     try { value = JSON.parse(text); } catch (e) { throw new Error(`Invalid JSON: ${e.message}.`); }

@@ -7,7 +7,7 @@ import { button, bytes, choice, clock, h, pick, retool, save, segments, shown, t
 import { clamp } from './camera.js';
 import { icon } from './icons.js';
 
-/** Quiet seconds after which the controls go: soon while something plays, later where nothing does. */
+/** Quiet seconds after which the controls hide: soon while something plays, later where nothing does. */
 const IDLE_PLAYING = 2.5;
 const IDLE_STILL = 8;
 /** Milliseconds that a short notice stays. */
@@ -68,7 +68,7 @@ export class Interface {
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
         this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
-    // Without room, an element of a user's page keeps what plays.
+    // Without space, an element of a user's page keeps what plays.
     for (const item of [this.back, this.next, this.loopTool, this.speed, ...spare]) item.classList.add('spare');
     this.root.classList.toggle('page', this.page);
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };
@@ -134,9 +134,9 @@ export class Interface {
       on(name, () => this.refresh());
     }
     on('scene', () => {
-      // The server knows more of the capture's cameras than the file.
+      // The server has more data of the capture's cameras than the file.
       if (this.capture?.cameras) p.meta.cameras = this.capture.cameras;
-      // What lies behind the scene, also where a poster leaves it free and before the first image.
+      // The background of the scene, also where a poster leaves it free and before the first image.
       const back = p.background ?? p.meta.background;
       this.stage.style.background = `rgb(${back.map(x => Math.round(255 * clamp(x, 0, 1)))})`;
     });
@@ -213,7 +213,7 @@ export class Interface {
     if (!this.#panel) this.wake();
   }
 
-  /** Distances that the depth view's brightness stands for. */
+  /** Distances that the depth view's brightness represents. */
   #showScale() {
     const p = this.player;
     this.scale.hidden = p.channel !== 'depth' || !p.file;
@@ -225,7 +225,7 @@ export class Interface {
   }
 
   #showTime() {
-    // The clock says what is shown; the slider is where it was put.
+    // The clock states what is shown; the slider is where it was put.
     const p = this.player, at = p.target - p.first;
     const u = p.duration > 0 ? clamp(at / p.duration, 0, 1) : 0;
     this.now.textContent = clock(p.time - p.first, p.duration);
@@ -385,7 +385,7 @@ export class Interface {
     this.root.classList.add('idle');
   }
 
-  // What people ask for.
+  // User requests.
 
   setLoop(on) {
     this.player.loop = on;
@@ -469,7 +469,7 @@ export class Interface {
     else this.toast('A path needs two keys: move the camera and press K');
   }
 
-  /** Cameras of the capture; fetched when first asked for. */
+  /** Cameras of the capture; fetched when first requested. */
   async #rigged() {
     const { Rig } = await import('./rig.js');
     return this.rig ??= new Rig(this, this.capture ?? {});
@@ -541,7 +541,7 @@ export class Interface {
   #turnKey(e, down) {
     const way = e.key.match(/^Arrow(Left|Right|Up|Down)$/)?.[1];
     if (!way) return false;
-    // Letting shift go first must not leave the turn on.
+    // Releasing shift first must not leave the turn on.
     if (down && !e.shiftKey) return false;
     return this.player.controls.key(`Turn${way}`, down);
   }
@@ -617,7 +617,7 @@ function known(page) {
   return before;
 }
 
-/** Whether a control wants this key for itself. */
+/** Whether a control needs this key for itself. */
 function takes(node, key) {
   if (!(node instanceof Element)) return false;
   if (node.matches('select, textarea, input:not([type=radio], [type=checkbox])')) return true;

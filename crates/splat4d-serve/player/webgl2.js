@@ -1,5 +1,5 @@
-// The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had. Every image
-// shows the time that its order was computed for (schedule.js).
+// The WebGL2 backend: words in textures, order from a worker, blending in half floats where that is to be had. Every
+// image shows the time that its order was computed for (schedule.js).
 
 import { NEAR } from './camera.js';
 import { SceneError } from './errors.js';
@@ -58,8 +58,8 @@ export class WebGL2Backend {
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
   #clip = [0, 0];
-  /// The worker's orders, in two textures in turn: `#front` is rendered, its first `#count` numbers; the other one holds the
-  /// order that is rendered next, with its figures.
+  /// The worker's orders, in two textures in turn: `#front` is rendered, its first `#count` numbers; the other one
+  /// holds the order that is rendered next, with its figures.
   #order;
   #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
   #front = 0;
@@ -70,7 +70,7 @@ export class WebGL2Backend {
   #splats = null;
   #sums;
   #timer;
-  /// Images that are being rendered, and what says that they are finished.
+  /// Images that are being rendered, and what states that they are finished.
   #flight = new Flight();
   #fences = [];
   #size = [0, 0];
@@ -142,7 +142,7 @@ export class WebGL2Backend {
     return this.#gl;
   }
 
-  /// Begins another scene: what was resident goes.
+  /// Begins another scene: resident pages are dropped.
   setScene(meta) {
     for (const id of [...this.#pages.keys()]) this.dropPage(id);
     this.#palettes.clear();
@@ -248,10 +248,10 @@ export class WebGL2Backend {
     this.#room(width, height);
   }
 
-  /// Renders the newest order at its time with the newest camera, and requests the next one: `time`, `at` and `epoch` are
-  /// what Schedule.want takes. Returns false where there is nothing new to show, or no order yet; `force` renders what there
-  /// is in any case. `target` {framebuffer, x, y}: where the image goes instead of the canvas (a headset's). `background`
-  /// null: nothing, premultiplied.
+  /// Renders the newest order at its time with the newest camera, and requests the next one: `time`, `at` and `epoch`
+  /// are what Schedule.want takes. Returns false where there is nothing new to show, or no order yet; `force` renders
+  /// what there is in any case. `target` {framebuffer, x, y}: where the image goes instead of the canvas (a headset's).
+  /// `background` null: nothing, premultiplied.
   draw({
     time, at = null, epoch = 0, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100,
     target = null, force = false,
@@ -365,7 +365,7 @@ export class WebGL2Backend {
       rows = Math.ceil(count / ORDER_WIDTH);
     if (back.rows < rows) {
       gl.deleteTexture(back.texture);
-      // Room for all that is resident, so that it does not grow in small steps.
+      // Space for all resident pages, so that it does not grow in small steps.
       back.rows = Math.min(Math.max(order.length / ORDER_WIDTH, 2 * back.rows), this.#maxRows);
       back.texture = texture(gl, gl.R32UI, ORDER_WIDTH, back.rows);
     }
@@ -385,7 +385,8 @@ export class WebGL2Backend {
 
   // Images
 
-  /// Renders the current order, unless the newest image shows it so already; `force`: in any case. Returns whether it did.
+  /// Renders the current order, unless the newest image shows it so already; `force`: in any case. Returns whether it
+  /// did.
   #redraw(force) {
     const last = this.#last,
       gl = this.#gl,
@@ -424,7 +425,7 @@ export class WebGL2Backend {
     return true;
   }
 
-  /// Takes up the order that came last.
+  /// Applies the latest order.
   #turn() {
     const { count, active, ms, generation } = this.#next;
     this.#front = 1 - this.#front;
@@ -516,7 +517,7 @@ export class WebGL2Backend {
     gl.disable(gl.BLEND);
   }
 
-  /// Writes the sums as an image; `turned`: its height where rows go from the bottom.
+  /// Writes the sums as an image; `turned`: its height where rows run from the bottom.
   #resolve(framebuffer, x, y, turned) {
     const gl = this.#gl,
       { program, at } = this.#show,

@@ -1,5 +1,5 @@
 // Draws a moving scene with WebGPU: pages stay on the GPU as the file's own words, and everything that depends on the
-// time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes a frame, and the list of
+// time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes per frame, and the list of
 // blocks, with the bits of their key masks, where the set of pages or the key times around this time change.
 
 import { NEAR } from './camera.js';
@@ -39,9 +39,9 @@ const FRAME_WORDS = 40;
 const VIEW_WORDS = 32;
 /// Constants of the renderer (CONVENTIONS.md).
 const ALPHA_MIN = 1 / 255;
-/// Workgroups along x; more go along y. WebGPU's default limit is 65,535.
+/// Workgroups along x; more along y. WebGPU's default limit is 65,535.
 const GROUPS_X = 32768;
-/// Blocks there is room for at first: one full page.
+/// Initial capacity in blocks: one full page.
 const FIRST_BLOCKS = 256;
 /// Rows of a texture that is read back begin at multiples of this (WebGPU).
 const ROW_BYTES = 256;
@@ -88,8 +88,8 @@ const SOFTWARE = /swiftshader|llvmpipe|lavapipe|software|basic render/i;
 export class WebGPUBackend {
   name = 'webgpu';
   stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
-  /// What the newest image shows: {time, epoch}; null before the first one of the scene. Culling and sorting run on the GPU in
-  /// the frame that they are for, so that this is what `draw` was given.
+  /// What the newest image shows: {time, epoch}; null before the first one of the scene. Culling and sorting run on the
+  /// GPU in the frame that they are for, so that this is what `draw` was given.
   shown = null;
   /// Images that the graphics processor still works on.
   flight = new Flight();
@@ -121,7 +121,7 @@ export class WebGPUBackend {
   #rangeStart = new Uint32Array([0xffffffff, 0]);
 
   /// Throws SceneError where WebGPU is missing or refuses; the canvas can then still be used for WebGL2.
-  /// `onlost(error)` is called at most once, when the device goes away or refuses a command; draw() then does nothing.
+  /// `onlost(error)` is called at most once, when the device is lost or refuses a command; draw() then does nothing.
   /// `hardware`: also refuse where the processor computes WebGPU, which it does slower than WebGL2.
   static async create(canvas, { onlost, hardware = false } = {}) {
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: 'high-performance' }).catch(() => null);
@@ -132,7 +132,7 @@ export class WebGPUBackend {
     if (hardware && (info.isFallbackAdapter || SOFTWARE.test(`${info.architecture} ${info.description}`))) {
       throw new SceneError('WebGPU would run on the CPU', '', 'Let the player use WebGL2.');
     }
-    // Everything fits the default limits; larger ones only make room for more Gaussians and larger images.
+    // Everything fits the default limits; larger ones only allow more Gaussians and larger images.
     const requiredLimits = {};
     for (const name of ['maxStorageBufferBindingSize', 'maxBufferSize', 'maxTextureDimension2D']) {
       requiredLimits[name] = adapter.limits[name];
@@ -228,7 +228,7 @@ export class WebGPUBackend {
       for (let i = 0; i < count; i++) words[i * held + k] = bytes[r + i] | bytes[g + i] << 8 | bytes[b + i] << 16;
     }
     const first = this.#paletteUsed;
-    // Without room the pages show their base colours.
+    // Without space the pages show their base colours.
     if (!this.#roomForPalette(first + words.length)) return;
     this.#paletteUsed += words.length;
     this.#queue.writeBuffer(this.#b.palette, 4 * first, words);
@@ -237,7 +237,7 @@ export class WebGPUBackend {
     this.#changed();
   }
 
-  /// Uploads a page; `entry` is its section. False: no room (see `capacity`), drop others first.
+  /// Uploads a page; `entry` is its section. False: no space (see `capacity`), drop others first.
   addPage({ id, count, headers, words }, entry) {
     if (this.#gone) return false;
     this.dropPage(id);
@@ -254,7 +254,7 @@ export class WebGPUBackend {
     }
     this.#writeHeaders(page);
     this.#queue.writeBuffer(this.#b.words, at * BLOCK_BYTES, words, 0, count * WORDS);
-    // All are admitted until a mask says otherwise; the place may have had one.
+    // All are admitted until a mask states otherwise; the place may have had one.
     const all = new Uint32Array(blocks * MASK_WORDS).fill(0xffffffff);
     this.#queue.writeBuffer(this.#b.admitted, at * MASK_BYTES, all);
     this.#pages.set(id, page);
@@ -442,7 +442,7 @@ export class WebGPUBackend {
     return made;
   }
 
-  /// Makes room for `least` blocks, at least twice as many as now where the device allows it. False: it does not.
+  /// Ensures capacity for `least` blocks, at least twice as many as now where the device allows it. False: it does not.
   #roomForBlocks(least) {
     const most = Math.floor(this.#maxBytes / BLOCK_BYTES), now = this.#runs.size;
     if (least <= now) return true;
@@ -545,7 +545,7 @@ export class WebGPUBackend {
     this.#culled.valid = false;
   }
 
-  /// struct Frame, as cull.wgsl has it.
+  /// struct Frame, as in cull.wgsl.
   #writeFrame({ time, view, channel, background, depthRange, flowScale }) {
     const f = this.#frame, u = this.#frameBits, m = view.cameraFromWorld;
     for (let c = 0; c < 4; c++) {
@@ -627,7 +627,7 @@ export class WebGPUBackend {
     pass.end();
   }
 
-  /// Copies counts and times to where they can be read, unless a reading is still under way.
+  /// Copies counts and times to where they can be read, unless a reading is still in progress.
   #copyStats(encoder) {
     if (this.#reading) return false;
     encoder.copyBufferToBuffer(this.#b.arguments, 0, this.#b.readback, 0, ARGUMENT_BYTES);
@@ -654,7 +654,7 @@ export class WebGPUBackend {
       }
       readback.unmap();
       this.#reading = false;
-    }, () => {}); // The device is gone; nothing is drawn any more.
+    }, () => {}); // The device is lost; nothing is rendered any more.
   }
 
   #makePicture() {

@@ -1,7 +1,7 @@
 // Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's image. Tested: that no
-// button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset. Never
-// tested for want of a device: a real headset, its frame rate, and how the order by depth, which WebGL2 computed for the head
-// of some frames ago, looks while the head turns. Both eyes show the time of one order.
+// button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset.
+// Never tested for lack of a device: a real headset, its frame rate, and how the order by depth, which WebGL2 computed
+// for the head of some frames ago, appears while the head turns. Both eyes show the time of one order.
 
 import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.js';
 
@@ -11,7 +11,7 @@ const TABLE_RADIUS = 0.6;
 /** WebXR's axes (x right, y up, z back) are ours turned half about x. */
 const FLIP = [0, 1, 0, 0];
 
-/** The contract's view of an eye; `start` is the camera that the headset's origin stands for, `unit` metres a unit. */
+/** The contract's view of an eye; `start` is the camera that the headset's origin represents, `unit` metres a unit. */
 export function eyeView(eye, start, unit, width, height) {
   const { position: p, orientation: o } = eye.transform;
   // Headset origin → world: the starting camera's pose; the eye's own pose is relative to it, in metres.
@@ -28,12 +28,12 @@ export function eyeView(eye, start, unit, width, height) {
     cx: (1 - P[8]) * width / 2, cy: (1 + P[9]) * height / 2 };
 }
 
-/** Where a device does not know its floor, this far below it, metres: it is held before a standing person. */
+/** Where a device does not report its floor, this far below it, metres: it is held before a standing person. */
 const FLOOR = -1.4;
-/** A scene in the room stands so far ahead at first, metres. */
+/** Initial distance of a scene in the room, metres. */
 const AHEAD = 1.2;
 
-/** A scene on the floor of the room: `start`, for which the headset's origin stands, is moved so that it is. */
+/** A scene on the floor of the room: `start`, which the headset's origin represents, is moved onto it. */
 class Standing {
   #start;
   #unit;
@@ -70,8 +70,8 @@ class Standing {
 }
 
 /**
- * Runs a session on the player; resolves when it has ended. `mode`: 'immersive-vr', where the viewer stands in the scene, or
- * 'immersive-ar', where the scene stands in the room and a tap on the floor puts it there.
+ * Runs a session on the player; resolves when it has ended. `mode`: 'immersive-vr', where the viewer is in the scene, or
+ * 'immersive-ar', where the scene is in the room and a tap on the floor puts it there.
  */
 export async function enter(player, mode = 'immersive-vr') {
   const ar = mode === 'immersive-ar';

@@ -1,4 +1,4 @@
-//! From a request to an answer: fixed routes, and headers that keep a browser from doing anything else with them.
+//! From a request to a response: fixed routes, and headers that keep a browser from doing anything else with them.
 
 use crate::assets::{self, Asset, INDEX};
 use crate::body::Body;
@@ -6,7 +6,7 @@ use crate::edit::{self, Editing};
 use crate::events::Hub;
 use crate::guard::Guard;
 use crate::photos::{self, Photos};
-use crate::range::{self, Wanted};
+use crate::range::{self, Requested};
 use crate::reply::{text, value, whole, with};
 use crate::scene::{Missing, Scene};
 use hyper::body::{Bytes, Incoming};
@@ -18,11 +18,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 
-/// Listeners of live news at a time; each keeps a connection for itself.
+/// Concurrent listeners of live events; each keeps a connection for itself.
 const MAX_LISTENERS: usize = 64;
 /// Name of the route of the scene.
 const SCENE: &str = "scene.s4d";
-/// On every answer. Another origin can neither embed nor read anything; a type is what it is said to be.
+/// Headers of every response. Another origin can neither embed nor read anything; a type is what it is declared to be.
 const HEADERS: [(HeaderName, &str); 5] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
@@ -83,7 +83,7 @@ fn policy(origin: &str) -> String {
     )
 }
 
-/// Answers one request.
+/// Handles one request.
 pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming) -> Response<Body> {
     let editing = match request.uri.path() {
         edit::ROUTE => shared.editing.as_ref(),
@@ -117,7 +117,7 @@ pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming
 }
 
 async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
-    // The path is compared as it is: nothing is decoded, nothing is joined to a folder.
+    // The path is compared undecoded and never joined to a folder.
     let path = request.uri.path().strip_prefix('/').unwrap_or_default();
     match path {
         SCENE => scene(shared, request),
@@ -211,24 +211,24 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {
         return with(Body::empty(), StatusCode::NOT_MODIFIED, &common);
     }
-    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No date
-    // is ever given out, so that a date matches nothing.
+    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No
+    // date is ever given out, so that a date matches nothing.
     let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
     let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
-    match range.and_then(|r| r.to_str().ok()).map_or(Wanted::Whole, |r| range::parse(r, version.length)) {
-        Wanted::Whole if request.method == Method::HEAD => {
+    match range.and_then(|r| r.to_str().ok()).map_or(Requested::Whole, |r| range::parse(r, version.length)) {
+        Requested::Whole if request.method == Method::HEAD => {
             let mut response = with(Body::empty(), StatusCode::OK, &common);
             response.headers_mut().insert(header::CONTENT_LENGTH, version.length.into());
             response
         }
-        Wanted::Whole => with(version.body(0, version.length), StatusCode::OK, &common),
-        Wanted::Part { start, end } => {
+        Requested::Whole => with(version.body(0, version.length), StatusCode::OK, &common),
+        Requested::Part { start, end } => {
             let mut response = with(version.body(start, end), StatusCode::PARTIAL_CONTENT, &common);
             let part = format!("bytes {start}-{}/{}", end - 1, version.length);
             response.headers_mut().insert(header::CONTENT_RANGE, value(&part));
             response
         }
-        Wanted::Nothing => {
+        Requested::Nothing => {
             let mut response = text(StatusCode::RANGE_NOT_SATISFIABLE, "the range starts after the end");
             response.headers_mut().insert(header::CONTENT_RANGE, value(&format!("bytes */{}", version.length)));
             response
@@ -263,7 +263,7 @@ async fn photo(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
     response
 }
 
-/// Whether a list of entity tags holds ours. Weak comparison, as `If-None-Match` has it.
+/// Whether a list of entity tags holds ours. Weak comparison, as for `If-None-Match`.
 fn matches(list: &HeaderValue, etag: &str) -> bool {
     let list = list.to_str().unwrap_or_default();
     list.split(',').map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)

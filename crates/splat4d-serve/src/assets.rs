@@ -93,9 +93,9 @@ pub fn assets() -> &'static [Asset] {
     ASSETS.get_or_init(|| FILES.iter().map(|(name, text)| Asset::new(*name, lean(text))).collect())
 }
 
-/// A module without the lines that are comments and nothing else: a quarter of what would be transferred. Line breaks stay,
-/// so that places in error messages are right. Our modules begin no line of a text with `//` or `/**` (a test holds that
-/// every line that goes was one of a comment).
+/// A module without the lines that are comments and nothing else: a quarter of what would be transferred. Line breaks
+/// stay, so that places in error messages are right. Our modules begin no line of a text with `//` or `/**` (a test
+/// holds that every removed line was one of a comment).
 fn lean(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut inside = false;
@@ -156,7 +156,8 @@ mod tests {
     use super::*;
     use std::collections::BTreeSet;
 
-    /// Bounds on what a browser transfers for the player with all that it may import later, and for the editor in addition.
+    /// Bounds on what a browser transfers for the player with all that it may import later, and for the editor in
+    /// addition.
     const MOST: usize = 95_000;
     const MOST_EDITOR: usize = 20_000;
 

@@ -1,4 +1,4 @@
-//! The body of an answer: bytes at hand, or a bounded channel that a task fills.
+//! The body of a response: bytes in memory, or a bounded channel that a task fills.
 
 use http_body::{Frame, SizeHint};
 use hyper::body::Bytes;
@@ -10,7 +10,7 @@ use tokio::sync::mpsc;
 /// Chunks that wait for a client: one on its way and one behind it.
 const WAITING: usize = 1;
 
-/// Body of an answer.
+/// Body of a response.
 #[derive(Debug)]
 pub(crate) enum Body {
     /// Bytes that are there.

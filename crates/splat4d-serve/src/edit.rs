@@ -1,8 +1,8 @@
-//! The one thing that a page may send: what it wants of a list of edits, where the program was started to edit.
+//! The only request with a body that a page may send: requests on a list of edits, if the program was started to edit.
 //!
-//! A page of any origin in the user's browser can send a form to loopback. This asks for more than a form can bring: a
-//! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets none),
-//! and our own origin. What is done with it is the program's business; it may answer with another scene.
+//! A page of any origin in the user's browser can send a form to loopback. This requires more than a form can send: a
+//! token that only the address which the program printed holds, JSON (which needs a preflight request, and gets none),
+//! and our own origin. The program decides what to do with it; it may return another scene.
 
 use crate::body::Body;
 use crate::reply::{text, whole};
@@ -31,28 +31,28 @@ const TOKEN: &str = "x-splat4d-token";
 const MAX_BODY: usize = 1 << 20;
 /// A body must be complete in this time.
 const BODY_TIME: Duration = Duration::from_secs(10);
-/// Questions that are worked on at a time: one that takes long, and one that looks meanwhile.
+/// Queries that are worked on at a time: a slow one, and one that only reads.
 const AT_ONCE: usize = 2;
 /// Least length of a token: shorter ones could be guessed.
 const LEAST_TOKEN: usize = 16;
 
-/// What a program answers to a page that edits.
+/// A program's response to a page that edits.
 #[derive(Clone, Debug, Default)]
-pub struct EditAnswer {
+pub struct EditResponse {
     /// Sent to the page.
     pub told: Value,
     /// The scene from now on, a `.s4d`; `told` gets its number as `version`.
     pub scene: Option<Arc<[u8]>>,
 }
 
-/// Does what a page asks for.
-type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
+/// Does what a page requests.
+type Handler = dyn Fn(Value) -> Result<EditResponse> + Send + Sync;
 
-/// Leave for pages that bring a token to ask a program for edits.
+/// Permission for pages with a token to request edits from a program.
 #[derive(Clone)]
 pub struct Editing {
     token: String,
-    answer: Arc<Answer>,
+    answer: Arc<Handler>,
     places: Arc<Semaphore>,
 }
 
@@ -64,7 +64,7 @@ impl fmt::Debug for Editing {
 
 impl Editing {
     /// `answer` is called on a thread of its own, on two at a time. Panics: a token that could be guessed.
-    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditAnswer> + Send + Sync + 'static) -> Self {
+    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditResponse> + Send + Sync + 'static) -> Self {
         assert!(token.len() >= LEAST_TOKEN && token.bytes().all(|b| b.is_ascii_alphanumeric()), "a token is random");
         Self { token, answer: Arc::new(answer), places: Arc::new(Semaphore::new(AT_ONCE)) }
     }
@@ -106,7 +106,7 @@ fn same(a: &[u8], b: &[u8]) -> bool {
     a.len() == b.len() && a.iter().zip(b).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
 }
 
-/// Answers what a page sent. Must be called on the server's runtime.
+/// Handles a page's request. Must be called on the server's runtime.
 pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, body: Incoming) -> Response<Body> {
     if let Some((status, why)) = editing.refuses(request) {
         return text(status, why);
@@ -124,7 +124,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     let work = editing.answer.clone();
     let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
         let _place = place;
-        // A page that has gone hears nothing.
+        // A disconnected page gets no response.
         let _ = sender.send(work(asked));
     });
     // A panic of the work ends its thread, and with it the channel.
@@ -132,7 +132,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     match done {
         None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the terminal of splat4d shows the reason"),
         Some(Err(error)) => refused(&error),
-        Some(Ok(EditAnswer { mut told, scene: fresh })) => {
+        Some(Ok(EditResponse { mut told, scene: fresh })) => {
             if let Some(bytes) = fresh {
                 told["version"] = json!(scene.set(bytes));
             }

@@ -1,7 +1,8 @@
-//! News of a live run, for pages that come, go and come back.
+//! Events of a live run, for pages that connect, disconnect and reconnect.
 //!
 //! There is no queue per client: news are in one bounded log, and a client is a place in it. So publishing never waits,
-//! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same log.
+//! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same
+//! log.
 
 use crate::body::Body;
 use crate::write_timeout::{Either, either};
@@ -12,41 +13,41 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, UNIX_EPOCH};
 use tokio::sync::watch;
 
-/// Steps kept. When they are full every second one goes, and from then on every second one comes: a loss curve keeps its
-/// shape and its whole length, equally dense everywhere.
+/// Steps kept. When they are full every second one is dropped, and from then on every second one is kept: a loss curve
+/// keeps its shape and its whole length, equally dense everywhere.
 const MAX_STEPS: usize = 2000;
 /// Notes kept, newest ones.
 const MAX_NOTES: usize = 100;
-/// Longest piece of news, bytes of JSON; a longer one is not sent. Steps have some 200.
+/// Longest event, bytes of JSON; a longer one is not sent. Steps have some 200.
 const MAX_NEWS: usize = 16 << 10;
 /// Least time between two packets to a client: faster than a person reads, slow enough for many clients.
 const PACE: Duration = Duration::from_millis(50);
-/// Time after which an empty line states that the connection lives; proxies cut silent ones after about 30 s.
+/// Time after which an empty line keeps the connection alive; proxies cut silent ones after about 30 s.
 const HEARTBEAT: Duration = Duration::from_secs(15);
-/// Milliseconds after which a browser comes back.
+/// Milliseconds after which a browser reconnects.
 const RETRY: u32 = 1000;
 /// In place of the newest number: there will be no more.
 const CLOSED: u64 = u64::MAX;
 
-/// A piece of news. On the wire: the object's fields and `kind`.
+/// An event. On the wire: the object's fields and `kind`.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum News {
-    /// `kind: "step"`: training went on: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
+    /// `kind: "step"`: training continued: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
     /// `seconds_left`, `stage`.
     Step(Value),
     /// `kind: "note"`: an event to be sent: `message`.
     Note(Value),
     /// `kind: "control"`: the run was paused, continued or stopped: `state`.
     Control(Value),
-    /// `kind: "done"`: the run is over; the server goes on serving.
+    /// `kind: "done"`: the run is over; the server continues serving.
     Done(Value),
 }
 
 #[derive(Clone, Debug)]
 struct Entry {
     id: u64,
-    /// How many of its kind came before it; only steps need it.
+    /// Number of earlier events of its kind; only steps need it.
     ordinal: u64,
     line: Arc<str>,
 }
@@ -56,7 +57,7 @@ struct Log {
     /// Number of the newest entry; the first is 1.
     newest: u64,
     steps: VecDeque<Entry>,
-    /// Of every so many steps one is kept, and the newest in addition: a power of two; 0 stands for 1.
+    /// Of every n steps one is kept, and the newest in addition: a power of two; 0 represents 1.
     stride: u64,
     /// Steps published.
     count: u64,
@@ -171,7 +172,7 @@ impl Hub {
             let _held = held;
             let mut packet = format!("retry: {RETRY}\n\n");
             loop {
-                // Marked as seen before the log is read: what comes in between is searched for again, and never missed.
+                // Marked as seen before the log is read, so that events in between are found by the next search.
                 if *newest.borrow_and_update() == CLOSED {
                     return;
                 }
@@ -195,7 +196,7 @@ impl Hub {
         body
     }
 
-    /// Where a client left off; the beginning where it does not say, or speaks of another server.
+    /// A client's last position; the beginning if it does not state it, or refers to another server.
     fn place(&self, last: Option<&str>) -> u64 {
         let known = last.and_then(|l| l.trim().split_once('-'));
         let known = known.filter(|(epoch, _)| u64::from_str_radix(epoch, 16) == Ok(self.epoch));

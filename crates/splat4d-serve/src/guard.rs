@@ -1,13 +1,13 @@
-//! Who may ask. A page of any origin in the user's browser can send requests to loopback, and a foreign name can be made
-//! to resolve to this machine (DNS rebinding), after which the browser takes that page for ours. So `Host` must be a name
-//! that only this machine's user has, and `Origin`, where it is sent, must be the same as `Host`.
+//! Access control. A page of any origin in the user's browser can send requests to loopback, and a foreign name can be
+//! made to resolve to this machine (DNS rebinding), after which the browser takes that page for ours. So `Host` must be
+//! a name that only this machine's user has, and `Origin`, where it is sent, must be the same as `Host`.
 
 use hyper::http::request::Parts;
 use hyper::http::uri::Authority;
 use hyper::{Method, StatusCode, Version, header};
 use std::net::IpAddr;
 
-/// Names under which the server may be asked.
+/// Host names that the server accepts.
 #[derive(Clone, Debug)]
 pub(crate) struct Guard {
     /// The host that the user gave, as typed.
@@ -32,8 +32,7 @@ impl Guard {
         Self { told: told.trim_matches(['[', ']']).to_ascii_lowercase(), open }
     }
 
-    /// Whether a request may be answered. `posts`: whether one of this path may be sent something, which has rules of its own
-    /// in addition.
+    /// Whether a request is allowed. `posts`: whether this path accepts a body, which has rules of its own in addition.
     pub(crate) fn check(&self, request: &Parts, posts: bool) -> Result<(), Refusal> {
         let known = request.method == Method::GET || request.method == Method::HEAD;
         let posts = posts && request.method == Method::POST;
@@ -52,7 +51,7 @@ impl Guard {
         let Some(host) = host.and_then(|h| h.to_str().ok()?.parse::<Authority>().ok()) else {
             return Err(refusal(StatusCode::BAD_REQUEST, "expected one Host header"));
         };
-        if host.as_str().contains('@') || !self.knows(host.host()) {
+        if host.as_str().contains('@') || !self.allows(host.host()) {
             return Err(refusal(
                 StatusCode::FORBIDDEN,
                 "this host name is not served: open the address that splat4d printed, or start it with --host NAME",
@@ -68,8 +67,8 @@ impl Guard {
                 return Err(refusal(StatusCode::FORBIDDEN, "pages of other origins may not read from here"));
             }
         }
-        // Where the browser states so itself: a foreign page that embeds something of ours without CORS. Following a link
-        // to the page is fine.
+        // Where the browser states so itself: a foreign page that embeds something of ours without CORS. Following a
+        // link to the page is fine.
         let fetch = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
         if fetch("sec-fetch-site") == Some("cross-site") && fetch("sec-fetch-mode") != Some("navigate") {
             return Err(refusal(StatusCode::FORBIDDEN, "pages of other origins may not read from here"));
@@ -77,7 +76,7 @@ impl Guard {
         Ok(())
     }
 
-    fn knows(&self, host: &str) -> bool {
+    fn allows(&self, host: &str) -> bool {
         let host = host.trim_matches(['[', ']']).to_ascii_lowercase();
         let address = host.parse::<IpAddr>();
         // Any port: a tunnel (ssh -L) may have another one at its end.

@@ -1,6 +1,6 @@
 //! The local web server of splat4d, and the browser's player that it carries.
 //!
-//! It serves one thing, a `.s4d` file or bytes in memory, to its own page: fixed routes, no folder, so nothing else can
+//! It serves one scene, a `.s4d` file or bytes in memory, to its own page: fixed routes, no folder, so nothing else can
 //! be reached. It binds loopback by default. Every page in the user's browser can reach loopback too, so it also checks
 //! `Host` (a foreign name that resolves to this machine) and `Origin` (a foreign page). During training it costs one
 //! thread with bounds on everything that a client can make it hold.
@@ -12,7 +12,7 @@
 //! | `/scene.s4d` | the scene, by range; `?v=N` names a live version: another one is 410, never a mixture |
 //! | `/config.json` | what the page shows: `{title, scene, live, …}` of [`Config::about`] |
 //! | `/events` | events of a live run as server-sent events; see [`News`] |
-//! | `/metrics.json` | the same events so far, in one piece |
+//! | `/metrics.json` | the events up to now, as one document |
 //! | `/photo` | an image of the capture, by camera and time, only with [`Config::photos`] |
 //! | `POST /control` | only with [`Config::control`]: pauses and stops a live run, by the rules of `/edit` |
 //! | `POST /edit` | only with [`Config::editing`]: requests of a page with the token for a list of edits |
@@ -36,7 +36,7 @@
 //! |---|---|
 //! | `write_timeout.rs`, `body.rs`, `range.rs`, `reply.rs` | timeouts, request bodies, byte ranges, responses |
 //! | `guard.rs` | who may send requests |
-//! | `scene.rs` | the one thing served: a file by range, or bytes that a live run replaces |
+//! | `scene.rs` | the served scene: a file by range, or bytes that a live run replaces |
 //! | `edit.rs` | the one guarded request that accepts input: edits, with a token |
 //! | `assets.rs`, `page.rs` | the player's files; player and scene as one static page |
 //! | `events.rs` | events of a live run: one bounded log |
@@ -59,7 +59,7 @@ mod server;
 mod write_timeout;
 
 pub use assets::{Asset, asset, assets};
-pub use edit::{EditAnswer, Editing};
+pub use edit::{EditResponse, Editing};
 pub use events::News;
 pub use page::{Page, SceneIn};
 pub use photos::{Photo, PhotoQuery, Photos};

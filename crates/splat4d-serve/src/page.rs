@@ -1,7 +1,8 @@
 //! The player and a scene as one static page, which works from any server and straight from a disk.
 //!
 //! A page opened from a disk may not import modules from next to it, so that every module becomes a blob made by the
-//! page itself: in the order of their imports, each with the `'./name.js'` strings in it replaced by the blobs before it.
+//! page itself: in the order of their imports, each with the `'./name.js'` strings in it replaced by the blobs before
+//! it.
 
 use crate::assets::{INDEX, assets, literal};
 use serde_json::json;
@@ -25,7 +26,7 @@ pub struct Page<'a> {
     pub scene: SceneIn<'a>,
 }
 
-/// Where a page's scene is.
+/// Source of a page's scene.
 #[derive(Clone, Debug)]
 pub enum SceneIn<'a> {
     /// In the page: the bytes of a `.s4d`.
@@ -108,8 +109,9 @@ impl Page<'_> {
     }
 }
 
-/// Makes blobs of modules and scene, and starts the page's modules. `SPLAT4D_ASSETS` gives workers their addresses: on a
-/// page from a disk they are `data:` ones, because Chromium starts no module worker from a blob there. `SPLAT4D_CONFIG` stands for the server's `/config.json`; its scene is a Blob, or an address.
+/// Makes blobs of modules and scene, and starts the page's modules. `SPLAT4D_ASSETS` gives workers their addresses: on
+/// a page from a disk they are `data:` ones, because Chromium starts no module worker from a blob there.
+/// `SPLAT4D_CONFIG` represents the server's `/config.json`; its scene is a Blob, or an address.
 const BOOT: &str = r#"(() => {
   const read = (id) => document.getElementById(id).textContent;
   const texts = new Map(JSON.parse(read('splat4d-modules')));
@@ -188,7 +190,7 @@ fn order<'a>(modules: &BTreeMap<&'a str, &'a str>) -> Result<Vec<&'a str>, Strin
     Ok(order)
 }
 
-/// The modules whose names stand in a text as `'./name'` or `"./name"`.
+/// The modules whose names are in a text as `'./name'` or `"./name"`.
 fn imports<'a>(text: &str, modules: &BTreeMap<&'a str, &'a str>) -> BTreeSet<&'a str> {
     let named = |name: &str| ['\'', '"'].iter().any(|q| text.contains(&format!("{q}./{name}{q}")));
     modules.keys().copied().filter(|name| named(name)).collect()

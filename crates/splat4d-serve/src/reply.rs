@@ -1,4 +1,4 @@
-//! Answers that are made in one piece.
+//! Responses in one piece.
 
 use crate::body::Body;
 use hyper::body::Bytes;

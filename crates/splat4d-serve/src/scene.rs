@@ -1,4 +1,4 @@
-//! The one thing that is served: a file on disk, or bytes in memory that may be replaced.
+//! The served scene: a file on disk, or bytes in memory that may be replaced.
 
 use crate::body::Body;
 use hyper::body::Bytes;
@@ -19,7 +19,7 @@ const VERSIONS: usize = 2;
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub enum Content {
-    /// Nothing yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
+    /// No scene yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
     #[default]
     Nothing,
     /// A `.s4d` file, read by range and never as a whole. It is opened once: a file that takes its place later is
@@ -52,7 +52,7 @@ pub(crate) struct Scene {
     versions: Mutex<(u64, Vec<Version>)>,
 }
 
-/// Looked for, not found.
+/// Searched, not found.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Missing {
     /// There is no scene yet, or no such version was ever there.
@@ -145,7 +145,7 @@ impl Version {
     pub(crate) fn body(&self, start: u64, end: u64) -> Body {
         match &self.source {
             Source::Bytes(bytes) => {
-                let [start, end] = [start, end].map(|i| usize::try_from(i).expect("it lies within memory"));
+                let [start, end] = [start, end].map(|i| usize::try_from(i).expect("it is in memory"));
                 Body::Bytes(bytes.slice(start..end))
             }
             Source::File(file) => {
@@ -158,7 +158,7 @@ impl Version {
                         let read = tokio::task::spawn_blocking(move || read_at(&file, at, length)).await;
                         let chunk = read.unwrap_or_else(|e| Err(io::Error::other(e)));
                         let failed = chunk.is_err();
-                        // Waits while the client is slow; fails once it has gone.
+                        // Waits while the client is slow; fails after it disconnects.
                         if sender.send(chunk).await.is_err() || failed {
                             return;
                         }

@@ -30,8 +30,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 pub const DEFAULT_PORT: u16 = 4440;
 /// Ports tried behind the default one where it is taken.
 const NEXT_PORTS: u16 = 20;
-/// Connections served at a time. Those beyond wait in the system's queue, where they cost the program nothing: a program
-/// may usually hold 1,024 files, and a run that trains needs some of them.
+/// Connections served at a time. Those beyond wait in the system's queue, where they cost the program nothing: a
+/// program may usually hold 1,024 files, and a run that trains needs some of them.
 const MAX_CONNECTIONS: usize = 256;
 /// Connections that the system lets wait; beyond these it refuses.
 const BACKLOG: u32 = 1024;
@@ -43,9 +43,9 @@ const MAX_HEAD: usize = 16 << 10;
 const MAX_HEADERS: usize = 64;
 /// Threads that read files.
 const READERS: usize = 2;
-/// Time that answers on their way are given to finish when the server stops.
+/// Time for responses in flight to finish when the server stops.
 const GRACE: Duration = Duration::from_millis(500);
-/// Pause after the system had no room for a connection.
+/// Pause after the system could not open a connection.
 const NO_ROOM: Duration = Duration::from_millis(100);
 /// How much the server's thread steps back for training (19 is most): a page still loads at once, training never waits.
 #[cfg(target_os = "linux")]
@@ -151,7 +151,7 @@ impl Running {
         &self.url
     }
 
-    /// Where it listens.
+    /// Listening address.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -161,15 +161,15 @@ impl Running {
         self.shared.hub.publish(news);
     }
 
-    /// Replaces the scene and notifies all pages, with the fields of `about` (such as `{"iteration": 500}`). Returns the
-    /// version's number. Pages that still read the version before it can finish.
+    /// Replaces the scene and notifies all pages, with the fields of `about` (such as `{"iteration": 500}`). Returns
+    /// the version's number. Pages that still read the version before it can finish.
     pub fn set_scene(&self, bytes: Arc<[u8]>, about: &Value) -> u64 {
         let version = self.shared.scene.set(bytes);
         self.shared.hub.snapshot(version, about);
         version
     }
 
-    /// Stops: answers on their way get half a second to finish.
+    /// Stops: responses in flight get half a second to finish.
     pub fn stop(mut self) {
         self.end();
     }
@@ -178,7 +178,7 @@ impl Running {
         self.shared.hub.close();
         self.stop.send_replace(true);
         if let Some(thread) = self.thread.take() {
-            // A panic in there is a bug of ours, and no reason to end what the caller is doing.
+            // A panic there is our bug and must not end the caller's work.
             let _ = thread.join();
         }
     }
@@ -200,7 +200,7 @@ fn runtime(background: bool) -> io::Result<Runtime> {
         .build()
 }
 
-/// Lowers this thread's priority. Where that fails it runs as it is.
+/// Lowers this thread's priority. If that fails the priority is unchanged.
 fn step_back(background: bool) {
     #[cfg(target_os = "linux")]
     if background {
@@ -254,7 +254,7 @@ fn bind(address: SocketAddr) -> io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// The address to open. One that stands for all of the machine's is opened at loopback.
+/// The address to open. One that represents all of the machine's is opened at loopback.
 fn url(host: &str, address: SocketAddr) -> String {
     let port = address.port();
     let bare = host.trim_matches(['[', ']']);
@@ -299,7 +299,7 @@ async fn accept(listener: TcpListener, shared: Arc<Shared>, mut stopped: watch::
 
 /// Serves one connection until it ends, stalls, or the server stops.
 async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermit, mut stopped: watch::Receiver<bool>) {
-    // Small answers leave at once; where that cannot be set they leave a little later.
+    // Small responses are sent at once; where that cannot be set, a little later.
     let _ = stream.set_nodelay(true);
     let service = service_fn(move |request: hyper::Request<_>| {
         let shared = shared.clone();
@@ -316,7 +316,7 @@ async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermi
     );
     let mut stop = pin!(stopped.changed());
     let mut stopping = false;
-    // Its errors are a client's: broken requests, or gone.
+    // Its errors are the client's: broken requests or disconnections.
     let _ = poll_fn(|cx| {
         if !stopping && stop.as_mut().poll(cx).is_ready() {
             stopping = true;

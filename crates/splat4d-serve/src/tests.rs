@@ -1,6 +1,6 @@
-//! The whole server on loopback: what clients ask, well and badly, and what they get.
+//! The whole server on loopback: valid and invalid requests, and the responses.
 
-use crate::{Config, Content, EditAnswer, Editing, News, Photo, Photos, Running, Server};
+use crate::{Config, Content, EditResponse, Editing, News, Photo, Photos, Running, Server};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -150,7 +150,7 @@ fn an_empty_scene_and_none() {
 }
 
 #[test]
-fn the_player_comes_compressed_where_that_is_understood() {
+fn the_player_is_compressed_for_clients_that_accept_it() {
     let server = of_bytes(b"x");
     for asset in crate::assets() {
         let target = format!("/player/{}", asset.name);
@@ -182,7 +182,7 @@ fn the_player_folder_is_read_at_every_request_and_no_other_file() {
 }
 
 #[test]
-fn every_answer_keeps_other_origins_out() {
+fn every_response_excludes_other_origins() {
     let server = of_bytes(b"x");
     for reply in [get(&server, "/"), get(&server, "/scene.s4d"), get(&server, "/none"), {
         ask(&server, "GET", "/", &[("host", "evil.example")])
@@ -398,7 +398,7 @@ fn a_thousand_connections_do_not_slow_the_publisher() {
     const NEWS: usize = 2000;
     let server = start(Config { live: true, background: true, ..Config::default() });
     server.set_scene(bytes(4 << 20).into(), &json!({}));
-    // A quarter each: idle, half a request, listening without reading, asking for much without reading.
+    // A quarter each: idle, half a request, listening without reading, requesting much without reading.
     let requests: [&[u8]; 4] = [
         b"",
         b"GET / HTTP/1.1\r\nhost: loc",
@@ -493,7 +493,7 @@ fn post(server: &Running, target: &str, headers: &[(&str, &str)], body: &[u8]) -
     for (name, value) in usual.iter().filter(|(n, _)| !given(n)).chain(headers).filter(|(_, v)| !v.is_empty()) {
         request += &format!("{name}: {value}\r\n");
     }
-    // A page that promised more than it sent has gone.
+    // A page that announced more than it sent is disconnected.
     let reply = raw(server, &[(request + "\r\n").as_bytes(), body].concat(), given("content-length"));
     let end = reply.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer has a head");
     let head = String::from_utf8(reply[..end].to_vec()).unwrap();
@@ -512,7 +512,7 @@ fn editor(asked: &Arc<std::sync::Mutex<Vec<Value>>>) -> Running {
             return Err(splat4d::Error::input("there is nothing to do").remedy("Give a step"));
         }
         let scene = (value["do"] == "bake").then(|| vec![7; 10].into());
-        Ok(EditAnswer { told: json!({"heard": value}), scene })
+        Ok(EditResponse { told: json!({"heard": value}), scene })
     });
     start(Config { content: Content::Bytes(bytes(1000).into()), editing: Some(editing), ..Config::default() })
 }
@@ -604,7 +604,7 @@ fn a_run_is_controlled_by_the_rules_of_edits() {
     let heard = asked.clone();
     let control = Editing::new(TOKEN.into(), move |value| {
         heard.lock().unwrap().push(value);
-        Ok(EditAnswer { told: json!({"state": "paused"}), scene: None })
+        Ok(EditResponse { told: json!({"state": "paused"}), scene: None })
     });
     let server = start(Config { live: true, control: Some(control), ..Config::default() });
     let pause = br#"{"do": "pause"}"#;

@@ -1,5 +1,5 @@
 //! A connection whose other end must keep taking bytes. The HTTP library times the head of a request; nothing times a
-//! client that asks for much and then reads nothing.
+//! client that requests much and then reads nothing.
 
 use std::future::{Future, poll_fn};
 use std::io;
@@ -34,7 +34,7 @@ impl WriteTimeout {
         Self { stream, window, clock: None, taken: 0 }
     }
 
-    /// Passes on what a write came to, and keeps the time.
+    /// Returns the result of a write, and keeps the time.
     fn judge(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         match written {
             Poll::Ready(Ok(n)) => {

@@ -1,4 +1,4 @@
-//! The player's copy of the shaders is what the .wgsl files say. `UPDATE_GOLDEN=1` writes it again.
+//! The player's copy of the shaders equals the .wgsl files. `UPDATE_GOLDEN=1` writes it again.
 
 use std::fs;
 use std::path::Path;

@@ -68,7 +68,7 @@ fn motion(bencher: Bencher<'_, '_>, threads: usize) {
     let mut tape = LayerTape::default();
     bencher.bench_local(|| {
         pool.install(|| {
-            tape.ask_active(&layer, Time(0.0));
+            tape.request_active(&layer, Time(0.0));
             layer.at(&Cache::default(), &mut tape);
         })
     });
@@ -78,7 +78,7 @@ fn motion(bencher: Bencher<'_, '_>, threads: usize) {
 fn motion_backward(bencher: Bencher<'_, '_>, threads: usize) {
     let (layer, pool) = (layer(), pool(threads));
     let (mut tape, cache, mut d_cache) = (LayerTape::default(), Cache::default(), Cache::default());
-    tape.ask_active(&layer, Time(0.0));
+    tape.request_active(&layer, Time(0.0));
     layer.at(&cache, &mut tape);
     let mut d_out = tape.out().zeros_like();
     fill(&mut d_out, 9);

@@ -11,7 +11,7 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Planes, SH, Space, Table, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::loss::image::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
+use splat4d_train::loss::image::{Channel, ImageTerm, LossGrads, Needs, Shown, View};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::maintenance::Limits;
 use splat4d_train::methods::{Group, Rate, Stage};
@@ -24,7 +24,7 @@ const LABEL: &str = "right_ball";
 const CAMERAS: usize = 6;
 const GAUSSIANS: usize = 60;
 
-/// Mean squared difference between drawn labels and those of the pixels.
+/// Mean squared difference between rendered labels and those of the pixels.
 struct Labels {
     /// By frame.
     truth: Vec<Planes<f32>>,
@@ -35,7 +35,7 @@ impl ImageTerm for Labels {
         Needs { depth: false, extra: vec![Channel::Sigmoid(LABEL.into())] }
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let (first, drawn) = shown.channel(&Channel::Sigmoid(LABEL.into())).expect("the scene has the column");
         let truth = &self.truth[view.frame];
         let count = drawn.pixels() as f32;

@@ -1,5 +1,5 @@
-//! Trains a synthetic dynamic scene in seconds, without a file: the renderer makes images of known Gaussians, and a new scene
-//! learns to reproduce them.
+//! Trains a synthetic dynamic scene in seconds, without a file: the renderer makes images of known Gaussians, and a new
+//! scene learns to reproduce them.
 //!
 //! `cargo run --release -p splat4d-train --example train_tiny [OUT.safetensors]`
 
@@ -24,7 +24,7 @@ const CAMERAS: usize = 8;
 const TIMES: usize = 6;
 const FPS: f64 = 10.0;
 
-/// What a trainer needs of a capture; `splat4d_train::capture` reads real ones.
+/// Data of a capture for the trainer; `splat4d_train::capture` reads real ones.
 struct Made {
     cameras: Vec<Camera>,
     /// [time][camera]
@@ -90,7 +90,7 @@ fn main() -> Result<()> {
         }
     }
 
-    // The recipe holds every setting; the plan adds what a program must know of the capture.
+    // The recipe holds every setting; the plan adds the capture's data for the program.
     let mut recipe = Recipe::default();
     for setting in ["iterations=400", "init=random", "num_pts=400", "max_cap=800", "sh_degree=0", "half_size_until=0"] {
         recipe.set(setting)?;
@@ -129,7 +129,7 @@ fn main() -> Result<()> {
     );
     let mut mse = 0.0;
     while !trainer.is_done() {
-        // The inner error names a number that was not finite; a run on disk would go back to its last checkpoint.
+        // The inner error names a number that was not finite; a run on disk would return to its last checkpoint.
         let step = trainer.step()?.map_err(|fault| splat4d::Error::input(fault.0))?;
         for step in &step.measured {
             mse = if mse == 0.0 { step.mse } else { 0.95 * mse + 0.05 * step.mse };

@@ -1,6 +1,5 @@
 //! Numbers of Gaussians as training images blend them, and the backward pass: what is learnt next to images while
-//! shapes, places
-//! and colours stay as they are ([`labels`](crate::labels), [`features`](crate::features)).
+//! shapes, places and colours are not changed ([`labels`](crate::labels), [`features`](crate::features)).
 
 use crate::capture::Capture;
 use splat4d::layers::{Evaluation, Scene};
@@ -33,7 +32,7 @@ impl Default for Blended {
 }
 
 impl Blended {
-    /// Draws a frame's view with `columns` of what is alive then, the last of which is 1 where a splat has numbers.
+    /// Renders a frame's view with `columns` of what is alive then, the last of which is 1 where a splat has numbers.
     pub(crate) fn draw(
         &mut self,
         scene: &Scene<f32>,
@@ -49,8 +48,8 @@ impl Blended {
         self.renderer.render(&shot, &mut self.image);
     }
 
-    /// The VJP of [`draw`](Self::draw): `give` hears, for every splat, of its layer and row, its number, the gradients to all
-    /// columns and the columns.
+    /// The VJP of [`draw`](Self::draw): `give` is called for every splat with its layer and row, its number, the
+    /// gradients to all columns and the columns.
     pub(crate) fn back(
         &mut self,
         scene: &Scene<f32>,
@@ -66,7 +65,7 @@ impl Blended {
         let grads = ImageGrads { color: &d_color, alpha: None, depth: None, extra: Some(d_extra) };
         let mut no_sh: Vec<Option<&mut Table<f32>>> = splats.parts.iter().map(|_| None).collect();
         self.renderer.backward(&shot, &grads, &mut no_sh, &mut self.grads);
-        let d = self.grads.extra.as_ref().expect("the channels were drawn");
+        let d = self.grads.extra.as_ref().expect("the channels were rendered");
         let mut first = 0;
         for (layer, tape) in self.instant.tapes().enumerate() {
             let rows = tape.out().rows();

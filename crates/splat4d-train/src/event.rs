@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Reports the progress of long work, and what the user should know.
+/// Reports the progress of long work, and messages for the user.
 pub struct Progress<'a>(pub &'a mut dyn FnMut(&Event));
 
 impl Progress<'_> {
@@ -12,13 +12,13 @@ impl Progress<'_> {
         (self.0)(&Event::Phase { name: name.to_owned(), done, total });
     }
 
-    /// Something the user should know: what, and what to do.
+    /// A message for the user: what happened, and what to do.
     pub fn warn(&mut self, message: String) {
         (self.0)(&Event::Warning { message });
     }
 }
 
-/// One piece of news. Serialised (with `type`) it is what `--json` prints, a line each.
+/// One event. `--json` prints it serialised (with `type`), one per line.
 #[derive(Clone, Debug, serde::Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 #[non_exhaustive]
@@ -27,14 +27,14 @@ pub enum Event {
     Phase {
         /// Name of the work in progress.
         name: String,
-        /// Done so far.
+        /// Finished.
         done: usize,
         /// To do in all; 0 when not known.
         total: usize,
     },
     /// Training begins.
     Started {
-        /// Where the run is written.
+        /// Folder of the run.
         #[serde(serialize_with = "crate::path_text::lossy")]
         run: PathBuf,
         /// First iteration (not 0 after a resume).
@@ -46,7 +46,7 @@ pub enum Event {
         /// Estimated peak memory of training, bytes.
         memory_estimate: u64,
     },
-    /// What a run will take, from steps that were timed before it.
+    /// Estimated time of a run, from steps timed before it.
     Predicted {
         /// Its steps.
         iterations: usize,
@@ -59,7 +59,7 @@ pub enum Event {
         /// Estimated peak memory of training, bytes.
         memory_estimate: u64,
     },
-    /// The run was given another length, because it would have ended at another time than was asked for.
+    /// The run was given another length, because it would not have ended at the requested time.
     Replanned {
         /// Steps taken.
         iteration: usize,
@@ -67,10 +67,10 @@ pub enum Event {
         iterations: usize,
         /// Seconds after the command's start at which it would have ended.
         seconds: f64,
-        /// The minutes that were asked for.
+        /// The minutes that were requested.
         minutes: f64,
     },
-    /// A step was taken; sent every so many iterations.
+    /// A step was taken; sent every n iterations.
     Progress {
         /// Steps taken.
         iteration: usize,
@@ -84,12 +84,12 @@ pub enum Event {
         psnr: f64,
         /// Gaussians now.
         gaussians: usize,
-        /// Seconds of training so far.
+        /// Seconds of training.
         seconds: f64,
         /// Seconds that are left, estimated.
         seconds_left: f64,
     },
-    /// On what a run trains, where that was asked for or changed.
+    /// On what a run trains, where that was requested or changed.
     Device {
         /// It in words, its driver too.
         name: String,
@@ -100,14 +100,14 @@ pub enum Event {
     Chosen {
         /// Its name.
         motion: String,
-        /// One sentence on what the capture is.
+        /// One sentence about the capture.
         why: String,
     },
     /// The number that `densify.max_cap = 0` has become.
     Counted {
         /// Gaussians at most.
         gaussians: usize,
-        /// What of the capture it follows from.
+        /// The reason from the capture.
         why: String,
     },
     /// A checkpoint is on disk.
@@ -118,7 +118,7 @@ pub enum Event {
         #[serde(serialize_with = "crate::path_text::lossy")]
         path: PathBuf,
     },
-    /// Something the user should know.
+    /// A message for the user.
     Warning {
         /// The finding and its remedy.
         message: String,
@@ -152,7 +152,7 @@ pub enum Event {
         gaussians: usize,
         /// Peak resident memory of the process, bytes; 0 where the system does not report it.
         peak_memory: u64,
-        /// What would improve the result, if the run ended too early or with too few Gaussians.
+        /// Advice to improve the result, if the run ended too early or with too few Gaussians.
         advice: Option<String>,
     },
 }

@@ -1,9 +1,10 @@
-//! Feature channels of a trained scene, learnt from images of features while all else stays as it is.
+//! Feature channels of a trained scene, learnt from images of features with all else fixed.
 //!
-//! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F − F*|² over the
-//! pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so that the loss has one
-//! minimum, which conjugate gradients come near in few rounds without any rate (Hestenes and Stiefel 1952), each channel by
-//! itself: a round draws every image once, forth and back. Few rounds also keep what pixels hardly see from growing.
+//! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F −
+//! F*|² over the pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so
+//! that the loss has one minimum, which conjugate gradients approach in few rounds without a learning rate (Hestenes
+//! and Stiefel 1952), each channel alone: a round renders every image once, forward and backward. Few rounds also keep
+//! what pixels hardly see from growing.
 //!
 //! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps next to
 //! colours.
@@ -20,9 +21,9 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds by default.
 pub const ROUNDS: usize = 8;
-/// Most images of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more add no information.
 pub const MOST_PICTURES: usize = 240;
-/// ε, weight in pixels of features that are 0: what no image shows has none.
+/// ε, weight in pixels of features that are 0: Gaussians that no image shows have none.
 const PRIOR: f64 = 1e-3;
 
 /// How well features are learnt.
@@ -36,7 +37,7 @@ pub struct FeatureScores {
     pub cosine: f64,
 }
 
-/// Frames of a list that have features, at most so many, evenly chosen.
+/// Frames of a list that have features, at most this many, evenly chosen.
 fn featured(capture: &Capture, frames: &[usize]) -> Vec<usize> {
     let all: Vec<usize> = frames.iter().copied().filter(|&i| capture.frames[i].features.is_some()).collect();
     let step = all.len().div_ceil(MOST_PICTURES).max(1);
@@ -59,8 +60,9 @@ fn truth(capture: &Capture, frame: usize, channels: Option<usize>) -> Result<Fea
     }
 }
 
-/// ½ Σ |F − s F*|² over the pixels that are known and show something, and its gradient to the blended sums Σ w f into `d_extra`
-/// (whose last plane, that of Σ w, stays 0: shapes do not learn); returns the loss and how many pixels it is of.
+/// ½ Σ |F − s F*|² over the pixels that are known and show something, and its gradient to the blended sums Σ w f into
+/// `d_extra` (whose last plane, that of Σ w, stays 0: shapes do not learn); returns the loss and how many pixels it is
+/// of.
 fn compare(
     values: &Planes<f32>,
     weight: &Planes<f32>,
@@ -146,11 +148,12 @@ fn pass(
     Ok((sum, loss, pixels))
 }
 
-/// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean
-/// loss of a
-/// known pixel before each round and after the last. `progress` receives how many images of how many are done, and may end the work.
+/// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean loss
+/// of a known pixel before each round and after the last. `progress` receives how many images of how many are done, and
+/// may end the work.
 ///
-/// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the first.
+/// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the
+/// first.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
@@ -170,7 +173,7 @@ pub fn learn(
     let total = (rounds + 1) * frames.len();
     let (mut residual, start, pixels) = pass(scene, capture, &frames, 1.0, &mut |i| progress(i, total))?;
     let (ones, minus) = (vec![1.0; channels], vec![-1.0; channels]);
-    // The gradient of features that are 0 is minus what they should be drawn to.
+    // The gradient of features that are 0 is minus what they should be rendered to.
     let zero = residual.clone();
     mix(&mut residual, &minus, &vec![0.0; channels], &zero);
     let (wanted, mut way) = (residual.clone(), residual.clone());
@@ -253,7 +256,7 @@ mod tests {
 
     const SIDE: usize = 32;
 
-    /// The features of a place on the wall: one grows to the right, one is a step downwards, one the same everywhere.
+    /// The features of a point on the wall: one grows to the right, one is a step downwards, one the same everywhere.
     fn asked(x: f64, y: f64) -> [f32; 3] {
         [x as f32, if y > 0.0 { 0.8 } else { -0.3 }, 0.5]
     }
@@ -329,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_get_the_features_of_what_they_show_and_rounds_never_make_it_worse() {
+    fn gaussians_get_features_and_rounds_never_increase_the_error() {
         let folder = tempfile::tempdir().unwrap();
         let (capture, mut scene) = (capture(folder.path()), wall());
         let before = scene.layers[0].params[GEOMETRY].clone();
@@ -354,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn invalid_features_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let mut capture = capture(folder.path());
         let say = |shape: &[usize], values: &[f32], capture: &Capture| {

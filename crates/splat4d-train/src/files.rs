@@ -10,10 +10,11 @@ use std::path::Path;
 const POINTER: &[u8] = b"version https://git-lfs";
 const POINTER_BYTES: u64 = 1024;
 
-/// What to do about a file that cannot be read.
+/// Remedy for an unreadable file.
 const CHECK: &str = "Check that the file exists and may be read by you.";
 
-/// Opens a file to read. Errors: none is there; a folder, pipe or device, on which reading could wait or never end; an empty file.
+/// Opens a file to read. Errors: none is there; a folder, pipe or device, on which reading could wait or never end; an
+/// empty file.
 pub fn open(path: &Path) -> Result<File> {
     // Files of the kernel, such as /proc/kmsg, claim to be regular and empty; reading them may wait or never end.
     match length(path, CHECK)? {
@@ -105,7 +106,8 @@ mod tests {
         }
     }
 
-    /// The kernel's files claim to be regular and empty. One of these has no end, one waits where the reader may open it.
+    /// The kernel's files claim to be regular and empty. One of these has no end, one waits where the reader may open
+    /// it.
     #[test]
     fn files_of_the_kernel_are_read_as_long_as_they_claim_to_be() {
         for path in ["/proc/self/status", "/proc/self/pagemap", "/proc/kmsg"].map(Path::new) {

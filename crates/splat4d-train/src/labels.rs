@@ -1,11 +1,11 @@
-//! Labels of a trained scene, learnt from masks of labels in its training images while all else stays as it is.
+//! Labels of a trained scene, learnt from masks of labels in its training images with all else fixed.
 //!
-//! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the cross-entropy
-//! −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the share of label k in
-//! Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and never makes the loss
-//! larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024); the following ones give a
-//! pixel to those of its Gaussians that others agree with. The sums are the renderer's gradient to the blended
-//! probabilities, with 1/P_y at label y as the image's gradient.
+//! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the
+//! cross-entropy −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the
+//! share of label k in Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and
+//! never makes the loss larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024);
+//! the following ones give a pixel to those of its Gaussians that others agree with. The sums are the renderer's
+//! gradient to the blended probabilities, with 1/P_y at label y as the image's gradient.
 //!
 //! Shapes and places learn nothing from labels: they are those that make the best images.
 
@@ -21,11 +21,11 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds by default: the cross-entropy of the bundled capture then changes by less than a percent a round.
 pub const ROUNDS: usize = 4;
-/// Most images of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more add no information.
 pub const MOST_PICTURES: usize = 240;
 /// Weight in pixels of the even vote that every Gaussian has: what no image shows keeps no label.
 const PRIOR: f64 = 1e-3;
-/// Probabilities are kept this far from 0: a wrong mask must not forbid a label for ever.
+/// Probabilities are kept this far from 0: a wrong mask must not forbid a label forever.
 const LEAST: f64 = 1e-6;
 
 /// How well labels are learnt.
@@ -37,7 +37,7 @@ pub struct LabelScores {
     pub pictures: usize,
     /// Share of the labelled pixels that show something whose likeliest label is right.
     pub accuracy: f64,
-    /// By label: pixels in both over pixels in either; `None`: it is in no image, neither true nor drawn.
+    /// By label: pixels in both over pixels in either; `None`: it is in no image, neither true nor rendered.
     pub iou: Vec<Option<f64>>,
 }
 
@@ -49,7 +49,7 @@ impl LabelScores {
     }
 }
 
-/// Frames of a list that have labels, at most so many, evenly chosen.
+/// Frames of a list that have labels, at most this many, evenly chosen.
 fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
     let all: Vec<usize> = frames.iter().copied().filter(|&i| capture.frames[i].labels.is_some()).collect();
     let step = all.len().div_ceil(most.max(1)).max(1);
@@ -57,7 +57,8 @@ fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
 }
 
 /// Learns the labels of the capture's training images into the scene, in place of those it had. Returns the mean
-/// cross-entropy of a pixel before each round, nats. `progress` receives how many images of how many are done, and may end the work.
+/// cross-entropy of a pixel before each round, nats. `progress` receives how many images of how many are done, and may
+/// end the work.
 ///
 /// Errors: those of `progress`; no training image has labels; a mask that cannot be read.
 pub fn learn(
@@ -162,7 +163,7 @@ pub fn best(extra: &Planes<f32>, p: usize) -> Option<usize> {
     (extra.plane(count)[p] >= SEEN).then(|| (0..count).max_by(likelier)).flatten()
 }
 
-/// Draws the blended probabilities of a frame's view.
+/// Renders the blended probabilities of a frame's view.
 fn draw(work: &mut Blended, scene: &Scene<f32>, capture: &Capture, frame: usize) {
     work.draw(scene, capture, frame, |instant| label_columns(scene, instant).expect("the scene has labels"));
 }
@@ -211,8 +212,8 @@ mod tests {
 
     const SIDE: u32 = 32;
 
-    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; its left half is labelled 0, its right half 1.
-    /// One pixel in nine of the first camera's mask is wrong.
+    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; its left half is labelled 0, its right
+    /// half 1. One pixel in nine of the first camera's mask is wrong.
     fn capture(folder: &Path) -> Capture {
         let mut cameras = Vec::new();
         for (c, shift) in [0.0, 0.4].into_iter().enumerate() {
@@ -260,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_get_the_label_of_what_they_show_and_rounds_never_make_it_worse() {
+    fn gaussians_get_labels_and_rounds_never_increase_the_error() {
         let folder = tempfile::tempdir().unwrap();
         let (capture, mut scene) = (capture(folder.path()), wall());
         let before = scene.layers[0].params[GEOMETRY].clone();

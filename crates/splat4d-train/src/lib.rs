@@ -4,7 +4,7 @@
 //! use splat4d_train::prelude::*;
 //!
 //! # fn main() -> Result<()> {
-//! # let folder = tempfile::tempdir().expect("there is room for a run");
+//! # let folder = tempfile::tempdir().expect("there is space for a run");
 //! # let run = folder.path().join("run");
 //! let mut recipe = Recipe::default();
 //! for setting in ["motion=spacetime", "iterations=20", "downscale=8", "max_frames=2"] {

@@ -28,7 +28,7 @@ pub fn in_command(path: &Path) -> String {
     if !text.is_empty() && text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', r"'\''")) }
 }
 
-/// For `#[serde(with = "…::path_text")]`: text that comes back as the same path.
+/// For `#[serde(with = "…::path_text")]`: text that parses to the same path.
 pub fn serialize<S: Serializer>(path: &Path, to: S) -> Result<S::Ok, S::Error> {
     to.serialize_str(&to_text(path))
 }
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn paths_come_back_as_they_were() {
+    fn paths_round_trip() {
         let mut paths = vec![PathBuf::from("a b/100 %.png"), PathBuf::from("ü\n"), PathBuf::from("%bytes:x")];
         #[cfg(unix)]
         paths.push(PathBuf::from(<OsString as std::os::unix::ffi::OsStringExt>::from_vec(b"/t/f_\xff%.ply".to_vec())));

@@ -1,12 +1,10 @@
-//! The recipe: every setting of a run, a table a subject. It is TOML on disk; the effective one is saved with the run, and a
-//! run repeats bit for bit from it (on the same SIMD level).
+//! The recipe: every setting of a run, a table a subject. It is TOML on disk; the effective one is saved with the run,
+//! and a run repeats bit for bit from it (on the same SIMD level).
 //!
 //! Tables are declared next to what they set (`settings!`); here they are only put together. Learning rates of
-//! positions
-//! are in units of the scene's extent; everything with time in it is stated per clip length. Iteration settings left
-//! at 0
-//! follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for `densify.max_cap`), which
-//! recipes had before they had tables, are read as well.
+//! positions are in units of the scene's extent; everything with time in it is stated per clip length. Iteration
+//! settings left at 0 follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for
+//! `densify.max_cap`), which recipes had before they had tables, are read as well.
 
 mod chunks;
 mod flat;
@@ -78,15 +76,15 @@ impl Recipe {
         self
     }
 
-    /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many Gaussians
-    /// goes by it. At least 1, and 1 for scenes that move, for which nothing else was measured.
+    /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many
+    /// Gaussians is divided by it. At least 1, and 1 for dynamic scenes, for which other values were not measured.
     pub(crate) fn crowd(&self) -> f64 {
         let many = self.run.motion == still::NAME && self.densify.max_cap > LEAST;
         if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 
-    /// Lets schedules that stand as they follow from the length follow from another one: what a run saved of them is set
-    /// back, what was chosen otherwise stays.
+    /// Lets schedules with the default for their length follow another length: what a run saved of them is set back,
+    /// what was chosen otherwise stays.
     #[must_use]
     pub fn unresolved(&self) -> Self {
         let follows = Self {
@@ -113,7 +111,7 @@ impl Recipe {
         r
     }
 
-    /// Fills every setting that is 0 and follows from others, so that the saved recipe says all.
+    /// Fills every setting that is 0 and follows from others, so that the saved recipe states all.
     #[must_use]
     pub fn resolve(&self) -> Self {
         let mut r = self.clone();

@@ -1,4 +1,4 @@
-//! Which frames a step sees: a pure function of (seed, stage, step), so that nothing has to be saved for a resume.
+//! The frames of a step: a pure function of (seed, stage, step), so that nothing has to be saved for a resume.
 
 use crate::capture::frames::Frames;
 use splat4d::math::Rng;
@@ -13,12 +13,12 @@ pub enum Sampler {
     Uniform,
     /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
     SameTime,
-    /// Four of five from a window of so many distinct times that slides over the clip as the stage proceeds, the rest from
-    /// the whole capture (long captures).
+    /// Four of five from a window of this many distinct times that slides over the clip as the stage proceeds, the rest
+    /// from the whole capture (long captures).
     Window(usize),
     /// Only frames at the k-th distinct time (per-frame tracking).
     Frame(usize),
-    /// The step's views at so many consecutive distinct times, one each.
+    /// The step's views at this many consecutive distinct times, one each.
     Tuple(usize),
 }
 
@@ -29,7 +29,7 @@ pub(crate) struct Draw {
     pub seed: u64,
     /// Number of the stage.
     pub stage: usize,
-    /// Steps taken in it: they address what is drawn.
+    /// Steps taken in it: they address the random numbers.
     pub taken: usize,
     /// Steps of its schedule that are behind it.
     pub place: usize,
@@ -45,8 +45,8 @@ const WINDOW_SHARE: f64 = 0.8;
 pub(crate) struct Timeline {
     frames: Vec<Vec<u32>>,
     count: usize,
-    /// The permutation looked finally: seed, address, length and the order itself. Without it every step would shuffle
-    /// all frames of the capture to learn of one.
+    /// The permutation used last: seed, address, length and the order itself. Without it every step would shuffle all
+    /// frames of the capture to learn of one.
     order: Arc<Mutex<(u64, u64, Vec<u32>)>>,
 }
 
@@ -77,7 +77,7 @@ impl Timeline {
         &self.frames[k]
     }
 
-    /// Element i of the permutation of n things at an address.
+    /// Element i of the permutation of n items at an address.
     fn shuffled(&self, seed: u64, address: u64, n: usize, i: usize) -> usize {
         let mut last = self.order.lock().unwrap_or_else(|e| e.into_inner());
         if (last.0, last.1, last.2.len()) != (seed, address, n) {
@@ -94,7 +94,7 @@ impl Timeline {
         let step_rng = rng.fork(step as u64 + 1);
         let (times, n) = (self.frames.len(), self.count);
         let flat = |i: usize| {
-            // The i-th draw without replacement: which epoch, and where in its permutation.
+            // The i-th sample without replacement: which epoch, and where in its permutation.
             self.shuffled(seed, (stage * 1_000_003 + i / n) as u64, n, i % n)
         };
         let any_of = |group: &[u32], draw: u64| group[step_rng.below(draw, group.len())] as usize;
@@ -122,7 +122,7 @@ impl Timeline {
                     .collect()
             }
             Sampler::Frame(k) => {
-                assert!(k < times, "the clip has {times} distinct times, frame {k} was asked");
+                assert!(k < times, "the clip has {times} distinct times, frame {k} was requested");
                 let group = &self.frames[k];
                 (0..batch).map(|b| group[(step * batch + b + step_rng.below(0, 2)) % group.len()] as usize).collect()
             }

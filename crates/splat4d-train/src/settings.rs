@@ -13,7 +13,7 @@ pub(crate) use when::is_off;
 /// One setting, for help, documents and checks.
 #[derive(Clone, Debug)]
 pub struct Setting {
-    /// The table that it stands in.
+    /// The table that it is in.
     pub table: &'static str,
     /// Its name in that table.
     pub field: &'static str,
@@ -23,7 +23,7 @@ pub struct Setting {
     pub doc: String,
     /// The permitted values and their unit.
     pub rule: Rule,
-    /// The words that it may be; none: it is no word.
+    /// The words that it may be; none: it is not a word.
     pub choices: Vec<&'static str>,
 }
 
@@ -56,7 +56,7 @@ pub enum Range {
 }
 
 impl Range {
-    /// Whether a number lies in it.
+    /// Whether a number is in it.
     pub(crate) fn holds(self, x: f64) -> bool {
         x.is_finite()
             && match self {
@@ -73,7 +73,7 @@ impl Range {
 }
 
 impl std::fmt::Display for Range {
-    /// Stands behind "It must be".
+    /// Follows "It must be".
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::NotNegative => write!(f, "zero or a positive number"),
@@ -112,7 +112,7 @@ impl Rule {
         self
     }
 
-    /// Whatever its table's condition says.
+    /// Whatever its table's condition states.
     pub(crate) const fn switch(mut self) -> Self {
         self.switch = true;
         self
@@ -175,7 +175,7 @@ pub(crate) trait Table {
     fn settings(&self, table: &'static str) -> Vec<Setting>;
     /// The value of a setting; `None`: it has no such setting.
     fn get(&self, field: &str) -> Option<toml::Value>;
-    /// Sets a setting. Errors: what its value must be, to stand behind "It must be"; an unknown name is our bug.
+    /// Sets a setting. Errors: what its value must be, to follow "It must be"; an unknown name is our bug.
     fn put(&mut self, field: &str, value: &toml::Value) -> Result<(), String>;
     /// Whether every number is in its range. Errors: the field, and what it must be.
     fn check(&self) -> Result<(), (&'static str, String)>;
@@ -196,8 +196,8 @@ pub(crate) fn hold<T: Value>(value: &T, rule: Rule) -> Result<(), String> {
     }
 }
 
-/// Declares a table of settings: `field: type = default;`, or `field: type = default => rule;` where it has a range of its
-/// own, a unit or a condition. `when (…)` behind the table's name is a condition on all that has no `switch()`.
+/// Declares a table of settings: `field: type = default;`, or `field: type = default => rule;` where it has a range of
+/// its own, a unit or a condition. `when (…)` behind the table's name is a condition on all that has no `switch()`.
 macro_rules! settings {
     (
         $(#[doc = $about:literal])*

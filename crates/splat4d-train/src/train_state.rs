@@ -1,8 +1,8 @@
 //! [`TrainState`]: what learns, with all that is remembered of it from step to step, row by row.
 //!
-//! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces the
-//! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
-//! and all that keep data of rows are notified: the learner notes how far it was `Touched`.
+//! A step changes numbers. Everything else that happens to a learner (rows are added, removed and moved, a hook
+//! replaces the scene, opacities are lowered) uses the methods here, so that scene, moments and statistics cannot get
+//! apart, and all that keep data of rows are notified: the learner notes how far it was `Touched`.
 
 mod corrections;
 mod exposure;
@@ -24,7 +24,7 @@ use splat4d::scene::{Born, RowEdit, Rows, Space, Table};
 pub(crate) struct Observation<'a, F> {
     /// The layer.
     pub layer: usize,
-    /// Its rows that were drawn: splat j is row `rows.id(j)`.
+    /// Its rows that were rendered: splat j is row `rows.id(j)`.
     pub rows: Rows<'a>,
     /// |dL/dmean2d| a splat, NDC units.
     pub mean2d: &'a [F],
@@ -38,7 +38,8 @@ const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count
 /// Statistics of every Gaussian since the last densification.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Stats {
-    /// One a layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that drew it, largest radius (pixels).
+    /// One per layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that rendered it, largest radius
+    /// (pixels).
     pub tables: Vec<Table<f32>>,
 }
 
@@ -61,7 +62,7 @@ impl Stats {
         });
     }
 
-    /// Mean gradient of a row, 0 where never drawn.
+    /// Mean gradient of a row, 0 where never rendered.
     pub(crate) fn gradient(&self, layer: usize, row: usize) -> f32 {
         let [sum, count] = self.tables[layer].read::<2>(row, 0);
         if count > 0.0 { sum / count } else { 0.0 }
@@ -97,7 +98,7 @@ pub struct TrainState {
     moments: Vec<Moments<f32>>,
     stats: Stats,
     touched: Touched,
-    /// Learnable exposures of the cameras; none: they show what is drawn.
+    /// Learnable exposures of the cameras; none: they show what is rendered.
     pub exposure: Option<Exposure>,
     /// Learnable corrections of poses and clocks; none: they are what the capture states.
     pub corrections: Option<Corrections>,
@@ -118,7 +119,7 @@ impl TrainState {
         Self { stats: Stats::new(&scene), moments, scene, touched: Touched::Values, exposure: None, corrections: None }
     }
 
-    /// A learner as a checkpoint has it. Panics: moments and statistics of another scene.
+    /// A learner from a checkpoint. Panics: moments and statistics of another scene.
     pub(crate) fn resumed(scene: Scene<f32>, moments: Vec<Moments<f32>>, stats: Stats) -> Self {
         let layers = scene.layers.len();
         assert_eq!([moments.len(), stats.tables.len()], [layers; 2], "moments and statistics by layer");
@@ -130,7 +131,7 @@ impl TrainState {
         &self.scene
     }
 
-    /// The scene, to change numbers in place. Its layers, tables and rows stay as they are: rows change through
+    /// The scene, to change numbers in place. Its layers, tables and rows are fixed: rows change through
     /// [`apply`](Self::apply), all else through `rebuild`.
     pub fn scene_mut(&mut self) -> &mut Scene<f32> {
         self.touch(Touched::Values);
@@ -142,7 +143,7 @@ impl TrainState {
         self.scene
     }
 
-    /// The layers that anything of may learn; rows of the others, which only stand there, are left alone.
+    /// The layers with learnable parts; rows of the other, fixed layers are left alone.
     pub(crate) fn learning(&self) -> Vec<usize> {
         let learns = |p: &splat4d::scene::Params<f32>| p.keys().any(|key| p.info(key).trainable);
         (0..self.scene.layers.len()).filter(|&l| learns(&self.scene.layers[l].params)).collect()
@@ -183,9 +184,9 @@ impl TrainState {
         self.touch(Touched::Rows);
     }
 
-    /// Changes the scene at will: layers, models, tables. Moments that still fit are kept, but for layers of another name;
-    /// those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten, and
-    /// statistics begin again.
+    /// Changes the scene freely: layers, models, tables. Moments that still fit are kept, but for layers of another
+    /// name; those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten,
+    /// and statistics begin again.
     pub(crate) fn rebuild(
         &mut self,
         learns: &dyn Fn(usize, &str) -> bool,
@@ -218,7 +219,7 @@ impl TrainState {
         self.touch(Touched::Rows);
     }
 
-    /// How far it was changed since this was last asked.
+    /// How far it was changed since the last call.
     pub(crate) fn take_touched(&mut self) -> Touched {
         std::mem::take(&mut self.touched)
     }

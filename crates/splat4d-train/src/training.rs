@@ -1,5 +1,5 @@
-//! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's verbs
-//! `train` and `eval` stand on the same functions of [`train`](crate::run) and [`eval`](crate::eval).
+//! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's
+//! verbs `train` and `eval` use the same functions of [`train`](crate::run) and [`eval`](crate::eval).
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
@@ -26,14 +26,14 @@ pub struct Training<'a> {
 impl<'a> Training<'a> {
     /// Opens a capture (a folder or its marker file) as the recipe states: scale, split, frames.
     ///
-    /// Errors: the folder is no capture; files that are missing or broken; a recipe out of range.
+    /// Errors: the folder is not a capture; files that are missing or broken; a recipe out of range.
     pub fn open(capture: impl AsRef<Path>, recipe: Recipe) -> Result<Self> {
         recipe.check()?;
         let capture = Arc::new(open_capture(capture.as_ref(), &recipe)?);
         Ok(Self { capture, recipe, options: TrainOptions::default(), listen: Box::new(|_| {}), stop: None })
     }
 
-    /// Keeps training to so many minutes from its opening, on a machine that turns slower or faster as well.
+    /// Keeps training to this many minutes from its opening, on a machine that turns slower or faster as well.
     #[must_use]
     pub fn minutes(mut self, minutes: f64) -> Self {
         self.options.minutes = Some(minutes);
@@ -84,7 +84,7 @@ impl Trained {
         format::scene::read(&bytes).map_err(|e| e.at(path.display()))
     }
 
-    /// Draws the held-out views, compares them with their images and writes `results.json` and `per_view.json`.
+    /// Renders the held-out views, compares them with their images and writes `results.json` and `per_view.json`.
     ///
     /// Errors: those of [`scene`](Self::scene); an image that cannot be read.
     pub fn evaluate(&self) -> Result<Scores> {

@@ -1,5 +1,5 @@
-//! A motion model from outside the library trains and plays: the one of `splat4d`'s example `own_motion`, with a program of
-//! its own. Its mathematics and this file are all that know it.
+//! A motion model from outside the library trains and plays: the one of `splat4d`'s example `own_motion`, with a
+//! program of its own. Its mathematics and this file are the only places that depend on it.
 
 use splat4d::Result;
 use splat4d::bake::{Options, bake};
@@ -121,7 +121,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         fixed_cameras: CAMERAS,
         ..recipe.plan()
     };
-    // The grass as it stands at rest, grey.
+    // The grass at rest, grey.
     let mut seeds = Seeds::default();
     let rest = &truth.layers[0].params;
     for row in 0..rest.len() {
@@ -144,7 +144,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
             exposure_lr: 0.0,
         },
     );
-    // What is shown half a swing from rest, where things are farthest from where they start.
+    // What is shown half a swing from rest, where objects are farthest from their start.
     let last = CAMERAS * (TIMES / 2);
     let shown = |trainer: &Trainer<'_>| {
         let mut instant = Evaluation::default();

@@ -137,7 +137,7 @@ impl Maintenance for Whiten {
     fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         train_state.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
         self.next += 1;
-        // The last row goes: rows change together with their moments and statistics.
+        // The last row is removed: rows change together with their moments and statistics.
         let mut edit = RowEdit::identity(Space::Gaussians, train_state.scene().len());
         edit.parent.pop();
         edit.born.pop();
@@ -152,7 +152,7 @@ impl Maintenance for Whiten {
     }
 }
 
-/// An operation runs, is in checkpoints, and goes on where it was.
+/// An operation runs, is in checkpoints, and continues where it was.
 #[test]
 fn a_custom_operation_runs_and_resumes_bit_for_bit() {
     let start = || trainer(Some(Whiten { next: 0 }));

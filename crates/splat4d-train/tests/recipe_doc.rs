@@ -64,8 +64,8 @@ prints the number and the reason. The search of the documentation site finds eve
 | page | tables |
 |---|---|
 | this page | run, capture, initial Gaussians, appearance, rates, refinement of cameras, lifespan, losses, chunks |
-| [recipe-models.md](recipe-models.md) | motion models, temporal filter, transport losses |
-| [recipe-density.md](recipe-density.md) | densification, pruning, merging, floaters, static layer |
+| [motion models](recipe-models.md) | motion models, temporal filter, transport losses |
+| [density control](recipe-density.md) | densification, pruning, merging, floaters, static layer |
 
 ## Change a setting
 
@@ -147,7 +147,7 @@ fn row(k: &Setting) -> String {
 }
 
 #[test]
-fn the_reference_is_what_the_recipe_does() {
+fn the_reference_equals_the_recipe() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     for page in &PAGES {
         let (path, text) = (folder.join(page.file), text(page));

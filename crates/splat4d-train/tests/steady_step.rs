@@ -17,9 +17,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Allocations a step: lists of a few views, cameras and questions, and blocks of the thread pool's queues.
+/// Allocations a step: lists of a few views, cameras and queries, and blocks of the thread pool's queues.
 const STEADY_ALLOCATIONS: usize = 60;
-/// Bytes a step. One number a Gaussian would be 20,000 already.
+/// Bytes per step. One number a Gaussian would be 20,000 already.
 const STEADY_BYTES: usize = 12_000;
 
 const GAUSSIANS: usize = 5000;
@@ -31,7 +31,7 @@ struct Counting;
 static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
 static BYTES: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: every call is handed to the system's allocator as it came.
+// SAFETY: every call is passed unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
@@ -41,7 +41,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the pointer came from `alloc` above, that is from the system.
+        // SAFETY: the pointer is from `alloc` above, that is from the system.
         unsafe { System.dealloc(pointer, layout) }
     }
 }

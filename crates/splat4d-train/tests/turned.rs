@@ -1,6 +1,6 @@
 //! A turned world needs no new training: what was learnt of a capture explains the same images of the world turned,
-//! shifted and scaled once its layer's frame states so, whatever the model. Models that see no absolute coordinates may also be
-//! asked in the turned world itself; the others, asked so, fail.
+//! shifted and scaled once its layer's frame states so, whatever the model. Models that see no absolute coordinates may
+//! also be queried in the turned world itself; the others fail there.
 
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Se3, Sim3, quat};
@@ -20,8 +20,8 @@ const CAMERAS: usize = 5;
 const FRAMES: usize = 6;
 /// Decibels that rounding may make.
 const ROUNDING: f64 = 0.01;
-/// Decibels that are lost at least where a model is asked for what it did not learn: its motion goes the wrong way, and what
-/// it draws of it in 300 steps is little. An image of a world that was not turned loses more.
+/// Decibels that are lost at least where a model is queried for motion that it did not learn: its motion goes the wrong
+/// way, and what it renders of it in 300 steps is little. An image of a world that was not turned loses more.
 const LOST: f64 = 0.25;
 
 /// Where the ball is, in units of the world.
@@ -139,8 +139,8 @@ fn a_turned_world_needs_no_new_training() {
         println!("{motion}: {before:.3} dB, by its frame in the turned world {after:.3}");
         assert!((after - before).abs() < ROUNDING, "{motion}: {before} and {after} dB");
         assert!(psnr(&scene, &larger, &recipe) < before - LOST, "{motion}: nothing was turned");
-        // Gaussians and nodes stand in the turned world, and the model is asked there. What nodes know of their surroundings is
-        // taken again, as it is wherever nodes are moved: also in the world that was not turned, since nodes learn.
+        // Gaussians and nodes are in the turned world, and the model is queried there. The nodes' context is computed
+        // again, as wherever nodes are moved: also in the world that was not turned, since nodes learn.
         let ask = |g: &Sim3, capture: &Path| {
             let mut asked = moved(&scene, g);
             if let Some(e) = context {

@@ -32,7 +32,7 @@ const COMPARED_POSES: usize = 12;
 const COMPARED_BESIDE: usize = 2;
 /// Longer side of those renders, pixels.
 const COMPARED_SIDE: usize = 800;
-/// Most bytes of a poster: it comes before everything else.
+/// Most bytes of a poster: it is first in the file.
 const POSTER_BYTES: usize = 30 << 10;
 /// Longer side of a poster and JPEG qualities, tried in turn until it is small enough.
 const POSTERS: [(usize, u8); 5] = [(640, 85), (640, 70), (480, 70), (320, 60), (160, 50)];
@@ -44,31 +44,31 @@ const PATH_STEP: f64 = 0.75;
 
 /// A file is to be so like its model, dB: what is lost by baking then hides behind what training leaves.
 pub const LIKE: f64 = 40.0;
-/// What a cut aims at beyond that, dB.
+/// Target of a cut beyond that, dB.
 const MARGIN: f64 = 0.3;
-/// A file may have the bytes of the learned scene and so many for each second of the clip: 12 Mbit/s, the rate of a
+/// A file may have the bytes of the learned scene and this many for each second of the clip: 12 Mbit/s, the rate of a
 /// streamed film of 1080 to 2160 lines.
 const BYTES_A_SECOND: f64 = 1.5e6;
 /// Bytes of a primitive, its share of the palette included, until the first file is written (docs/format.md: 32 before
 /// deflate).
 const BYTES_A_PRIMITIVE: f64 = 28.0;
-/// Cuts that are tried: the first, one that is calibrated by it, and one that mends what that missed.
+/// Cuts that are tried: the first, one that is calibrated by it, and one that corrects its error.
 const CUTS: usize = 3;
 /// A file this much larger than it may be is cut again.
 const TOO_LARGE: f64 = 1.03;
 /// A finer cut is tried where it may have this many times the primitives.
 const FINER: f64 = 1.05;
-/// A file this much more like its model than wanted, dB, is cut again, coarser.
+/// A file this much more like its model than requested, dB, is cut again, coarser.
 const SPARE: f64 = 2.0;
-/// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
-/// packing and comparing take the rest.
+/// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames,
+/// fitting, packing and comparing take the rest.
 const SAMPLING: f64 = 0.25;
 /// The same of renders that measure how strongly images react to errors, of fixed cameras and of one that moves; and
 /// how many ordinary renders one of them takes.
 const WEIGHING: f64 = 0.1;
 /// See [`WEIGHING`].
 const WEIGHING_RENDERS: f64 = 3.0;
-/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into it.
+/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of the remaining time for it.
 const SECONDS_A_PRIMITIVE: f64 = 4e-5;
 const FITTING: f64 = 0.4;
 /// Another cut takes about as long as the last one took, and this many times it is kept for it.
@@ -121,7 +121,7 @@ pub struct Packed {
     at: Option<(f64, [f64; 2])>,
 }
 
-/// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
+/// Bakes a scene and packs it, without comparing the result. The options' cameras are the source's.
 pub fn pack(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Packed> {
     pack_scene(&source.scene, source, title, baking, console)
 }
@@ -153,7 +153,7 @@ fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
     if deadline.is_set() {
         let mut instant = Evaluation::default();
         let middle = Time(0.5 * (scene.clip[0] + scene.clip[1]));
-        // The first one makes room.
+        // The first one is a warm-up.
         scene.at(middle, &mut instant);
         let began = deadline.now();
         scene.at(middle, &mut instant);
@@ -182,7 +182,7 @@ struct Kitchen<'a> {
 }
 
 impl Kitchen<'_> {
-    /// What segments cost, where they are not cut by a tolerance.
+    /// Price of segments, unless cut by a tolerance.
     fn curve(&self, bakery: &mut Bakery<'_>) -> Result<Option<Curve>> {
         match self.baking.tolerance {
             Some(_) => Ok(None),
@@ -197,7 +197,7 @@ impl Kitchen<'_> {
         (bytes / bytes_a_primitive).min(FITTING * left / SECONDS_A_PRIMITIVE)
     }
 
-    /// The price that the curve asks for, before anything was compared.
+    /// The price that the curve requests, before anything was compared.
     fn first_price(&self, curve: &Curve) -> f64 {
         let wanted = curve.price_for(mse(LIKE + MARGIN)).unwrap_or(0.0);
         wanted.max(curve.price_of(self.most(BYTES_A_PRIMITIVE)))
@@ -240,7 +240,8 @@ fn mse(psnr: f64) -> f64 {
 
 /// Bakes a run or a scene file into the file `out`, and writes how well as JSON into `report`; returns the same.
 ///
-/// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of outputs.
+/// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of
+/// outputs.
 pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, listener: &dyn Listener) -> Result<Value> {
     if !files::is_playback(out) && !out.starts_with("/dev") {
         return Err(Error::input("the name does not end in .s4d")
@@ -285,12 +286,12 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,
         "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
-    say(report, likeness.as_ref(), summary.bytes, seconds, console);
+    print_summary(report, likeness.as_ref(), summary.bytes, seconds, console);
     if report.primitives == 0 {
         console.warn("no Gaussian of the scene is visible at any time of the clip: the file renders as background.");
     }
     if let (Some(needs), Some(l)) = (needs, &likeness) {
-        console.say(&needs.in_words(l.psnr, summary.bytes));
+        console.result(&needs.in_words(l.psnr, summary.bytes));
     }
     if antialias {
         console.warn(
@@ -303,7 +304,7 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
     Ok(value)
 }
 
-/// What a file that is less like its model than wanted would need.
+/// Requirements of a file that is less like its model than requested.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Needs {
     /// dB.
@@ -326,7 +327,7 @@ impl Needs {
     }
 }
 
-/// A file, how like its model it is, and what it would take to be as like it as wanted, where it is not.
+/// A file, how like its model it is, and what it would take to be as like it as requested, where it is not.
 pub struct Cooked {
     pub packed: Packed,
     pub likeness: Option<bake::Likeness>,
@@ -334,7 +335,7 @@ pub struct Cooked {
 }
 
 impl Cooked {
-    /// Greater is better: within its bytes, then as like its model as wanted, then small.
+    /// Greater is better: within its bytes, then as like its model as requested, then small.
     fn rank(&self, most: f64) -> [f64; 3] {
         let bytes = self.packed.bytes.len() as f64;
         let psnr = self.likeness.as_ref().map_or(0.0, |l| l.psnr);
@@ -342,8 +343,8 @@ impl Cooked {
     }
 }
 
-/// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
-/// further off than a comparison can measure, without sampling the model again.
+/// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut
+/// was further off than a comparison can measure, without sampling the model again.
 pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
@@ -363,7 +364,7 @@ pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Li
         let mut needs = None;
         let mut next = None;
         if let (Some(curve), Some((at, [pieces, error])), Some(like)) = (&curve, packed.at, &likeness) {
-            // What the file differs by beyond what its segments do is the rounding's, and stays.
+            // The difference beyond that of the segments is due to rounding, and stays.
             let scale = mse(like.psnr) / error.max(f64::MIN_POSITIVE);
             let wanted = curve.price_for(mse(LIKE + MARGIN) / scale);
             let each = bytes / packed.baked.report.primitives.max(1) as f64;
@@ -391,7 +392,13 @@ pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Li
     Ok(best.expect("one file was packed"))
 }
 
-fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &dyn Listener) {
+fn print_summary(
+    report: &bake::Report,
+    likeness: Option<&bake::Likeness>,
+    bytes: u64,
+    seconds: f64,
+    console: &dyn Listener,
+) {
     let mut words = format!(
         "{} Gaussians became {} primitives in {} time segments, {} in {seconds:.1} s",
         grouped(report.gaussians),
@@ -408,17 +415,17 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
             words += &format!("; {} {what}", grouped(count));
         }
     }
-    console.say(&words);
+    console.result(&words);
     let e = &report.errors;
     if e.worst > 0.0 {
         let tolerance = report.tolerance.map(|t| format!(" (tolerance {t:.3} px)")).unwrap_or_default();
-        console.say(&format!(
+        console.result(&format!(
             "error per Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
             e.median, e.p99, e.worst
         ));
     }
     if let Some(l) = likeness {
-        console.say(&format!(
+        console.result(&format!(
             "the file against its model: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
@@ -436,7 +443,7 @@ fn compare(
     console: &dyn Listener,
 ) -> Result<Option<bake::Likeness>> {
     if deadline.left() <= 0.0 {
-        console.say("the file is not compared with its model: no time is left of option `minutes`");
+        console.result("the file is not compared with its model: no time is left of option `minutes`");
         return Ok(None);
     }
     likeness(scene, &playback::read(bytes)?, &shots(scene, stage, views), antialias, &mut |done, total| {
@@ -445,7 +452,8 @@ fn compare(
     })
 }
 
-/// Compares what a file shows with what its scene shows, until `go_on` states no; it is given how many renders are done, of how many.
+/// Compares what a file shows with what its scene shows, until `go_on` states no; it is given how many renders are
+/// done, of how many.
 pub fn likeness(
     scene: &Scene<f32>,
     played: &Scene<f32>,

@@ -4,7 +4,8 @@
 //! {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "background": [0, 0, 0],
 //!  "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
 //! ```
-//! `width` and `height` may stand for `w` and `h`. The pose is a row-major 4x4 in OpenCV axes (x right, y down, z forward); pixel centres are at +0.5.
+//! `width` and `height` may represent `w` and `h`. The pose is a row-major 4x4 in OpenCV axes (x right, y down, z
+//! forward); pixel centres are at +0.5.
 
 use crate::files::read_text;
 use serde_json::Value;
@@ -15,9 +16,9 @@ use splat4d_train::settings::nearest;
 use std::path::Path;
 
 const KEYS: [&str; 11] = ["fx", "fy", "cx", "cy", "w", "h", "width", "height", "world_to_camera", "near", "background"];
-/// Longest side of an image that is drawn, pixels.
+/// Longest side of an image that is rendered, pixels.
 pub const MAX_SIDE: usize = 16_384;
-/// Most pixels of an image that is drawn: 8K video twice over; about 4 GiB of working memory.
+/// Most pixels of an image that is rendered: 8K video twice over; about 4 GiB of working memory.
 pub const MAX_PIXELS: usize = 1 << 26;
 /// Largest |R Rᵀ − I| that counts as rounding of the file.
 const MAX_SHEAR: f64 = 0.01;

@@ -94,7 +94,7 @@ fn find(store: &ImageStore, list: &[Listed], wanted: &PhotoQuery) -> Option<Phot
     Some(Photo { jpeg, time: frames[nearest].time.0 })
 }
 
-/// An image whose longer side has at most so many pixels.
+/// An image whose longer side has at most this many pixels.
 fn reduced(picture: RgbImage, side: u32) -> RgbImage {
     let (w, h) = picture.dimensions();
     if w.max(h) <= side {
@@ -104,8 +104,8 @@ fn reduced(picture: RgbImage, side: u32) -> RgbImage {
     resize(&picture, scaled(w), scaled(h), FilterType::Triangle)
 }
 
-/// The points of a capture as a static scene of dots over the capture's time; a capture without points has one dot where
-/// its cameras look.
+/// The points of a capture as a static scene of dots over the capture's time; a capture without points has one dot
+/// where its cameras point.
 pub fn points(capture: &Capture) -> Scene<f32> {
     let none = PointCloud::default();
     let cloud = capture.points.as_ref().unwrap_or(&none);

@@ -59,8 +59,8 @@ pub fn in_words(outlook: &ChunkEstimate) -> String {
     words
 }
 
-/// Does what is wanted of a capture, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
-/// was to do.
+/// Does the requested work on a capture, and appends what is finished to its playback file, within the options'
+/// minutes. `None`: nothing was to do.
 pub fn work(
     run: &Path,
     chunked: &Chunked,
@@ -71,7 +71,7 @@ pub fn work(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
     let deadline = Deadline::of(options.clock.clone(), options.minutes);
-    // What goes wrong with it never costs a chunk, and is made good at the join.
+    // Its errors never fail a chunk, and are corrected at the join.
     let append = || {
         if let Err(e) = growing::append(run, chunked, &baking(chunked, &deadline), stop, console) {
             console.warn(&format!("the playback file does not grow: {e}"));
@@ -111,7 +111,7 @@ pub fn join(
 ) -> Result<()> {
     let joined = chunked.join()?;
     let Joined { chunks, gaussians, seconds, peak_memory, .. } = joined;
-    console.say(&format!(
+    console.result(&format!(
         "{chunks} chunks, {gaussians} Gaussians, {:.1} minutes of training, {} at most in a part",
         seconds / 60.0,
         human_bytes(peak_memory)
@@ -121,16 +121,16 @@ pub fn join(
     console.clear();
     if let Some(seams) = &seams {
         let whose = if seams.held_out { "held-out" } else { "training" };
-        console.say(&format!(
+        console.result(&format!(
             "flicker at chunk boundaries: {:.3}/255, within chunks {:.3}/255 ({whose} cameras, {} boundaries)",
             seams.across, seams.inside, seams.cuts
         ));
     }
     evaluating::amend(run, [("seams".into(), json!(seams)), ("chunk_peak_memory".into(), json!(peak_memory))])?;
-    console.say(&format!("wrote {}", path.display()));
+    console.result(&format!("wrote {}", path.display()));
     let started = Instant::now();
     let bytes = growing::complete(run, chunked, &baking(chunked, deadline), stop, console)?;
-    console.say(&format!("the playback file has {}", human_bytes(bytes)));
+    console.result(&format!("the playback file has {}", human_bytes(bytes)));
     evaluating::amend(
         run,
         [
@@ -157,7 +157,7 @@ fn seams(chunked: &Chunked, deadline: &Deadline, console: &dyn Listener) -> Resu
         &mut |event| console.event(event),
     )?;
     if let Some(done) = ended {
-        console.say(&format!(
+        console.result(&format!(
             "flicker at chunk boundaries is measured at {done} of them: option `minutes` leaves no time for more"
         ));
     }

@@ -5,8 +5,8 @@ use serde_json::Value;
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are those
-/// of 3DGS' `results.json`, whatever their case.
+/// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are
+/// those of 3DGS' `results.json`, whatever their case.
 pub const SCORES: [(&str, usize, bool); 8] = [
     ("PSNR", 2, true),
     ("PSNR-dynamic", 2, true),
@@ -25,14 +25,14 @@ pub const WORDS: [&str; 2] = ["run", "motion"];
 #[derive(Clone, Debug, Default)]
 pub struct Entry {
     pub name: String,
-    /// What it shows, in the order of [`SCORES`].
+    /// Scores, in the order of [`SCORES`].
     pub scores: Vec<Option<f64>>,
     pub motion: Option<String>,
     pub steps: Option<usize>,
     pub gaussians: Option<usize>,
     pub seconds: Option<f64>,
     pub bytes: Option<u64>,
-    /// What was measured, where the results say it: two that differ cannot be compared.
+    /// Identity of the measurement, where the results contain it: different ones cannot be compared.
     pub capture: Option<String>,
     pub views: Vec<ViewScore>,
     /// Folder of `gt` and `renders`, where it is kept.
@@ -43,7 +43,7 @@ pub struct Entry {
 impl Entry {
     /// A run, a folder with `results.json`, or such a file.
     ///
-    /// Errors: nothing of that kind; a file that is no JSON; no score that is known.
+    /// Errors: nothing of that kind; a file that is not JSON; no score that is known.
     pub fn open(path: &Path) -> Result<Self> {
         if Run::is(path) {
             let run = Run::open(path)?;
@@ -84,8 +84,8 @@ impl Entry {
         })
     }
 
-    /// Results of another program: `{"ours_30000": {"PSNR": …}}` as 3DGS writes them, `{"results": {"psnr": …}}` as nerfstudio,
-    /// or the scores themselves.
+    /// Results of another program: `{"ours_30000": {"PSNR": …}}` as 3DGS writes them, `{"results": {"psnr": …}}` as
+    /// nerfstudio, or the scores themselves.
     fn of_file(file: &Path) -> Result<Self> {
         let bytes = crate::files::read(file)?;
         let text = String::from_utf8_lossy(&bytes);
@@ -165,7 +165,8 @@ pub fn differences(entries: &[Entry]) -> Vec<String> {
     out
 }
 
-/// The place of the best row in each column of [`SCORES`] that at least two rows have; none if the rows cannot be compared.
+/// The place of the best row in each column of [`SCORES`] that at least two rows have; none if the rows cannot be
+/// compared.
 pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
     if !differences(entries).is_empty() {
         return vec![None; SCORES.len()];
@@ -201,7 +202,7 @@ pub fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
     (columns.iter().map(|(name, _)| name.clone()).collect(), rows.collect())
 }
 
-/// The place of a column's score in [`SCORES`]; `None`: it is no score.
+/// The place of a column's score in [`SCORES`]; `None`: it is not a score.
 pub fn score_of(column: &str) -> Option<usize> {
     SCORES.iter().position(|(name, ..)| *name == column)
 }

@@ -31,8 +31,8 @@ impl Form {
     }
 }
 
-/// Compares runs, and results of other programs, by their scores of held-out views: reports a table, and writes it to each of
-/// `outputs` (.csv, .md, or .html with images side by side and curves).
+/// Compares runs, and results of other programs, by their scores of held-out views: reports a table, and writes it to
+/// each of `outputs` (.csv, .md, or .html with images side by side and curves).
 ///
 /// Errors: nothing of that kind, no scores, an output of another ending or in the place of what is compared.
 ///
@@ -43,7 +43,7 @@ impl Form {
 /// # }
 /// ```
 pub fn compare(runs: &[PathBuf], outputs: &[PathBuf], console: &dyn Listener) -> Result<()> {
-    // What cannot be written is better known before the work.
+    // Unwritable outputs are reported before the work.
     let inputs: Vec<Input<'_>> =
         runs.iter().map(|run| Input { may_hold: run.is_dir(), ..Input::new(run, "what is compared,") }).collect();
     let mut forms = Vec::new();
@@ -56,7 +56,7 @@ pub fn compare(runs: &[PathBuf], outputs: &[PathBuf], console: &dyn Listener) ->
         console.warn(&format!("{difference}: their scores cannot be compared."));
     }
     let (head, rows) = comparing::table(&entries);
-    text(&head, &rows).iter().for_each(|line| console.say(line));
+    text(&head, &rows).iter().for_each(|line| console.result(line));
     console.emit(&objects(&entries));
     for (output, form) in outputs.iter().zip(forms) {
         let bytes = match form {

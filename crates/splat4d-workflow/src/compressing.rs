@@ -28,12 +28,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// Times that the guard (or the size) may ask for another round.
+/// Times that the guard (or the size) may request another round.
 const MOST_TRIES: usize = 3;
-/// The guard takes back this share of the pruning.
+/// The guard reduces the pruning by this share.
 const GENTLER: f64 = 0.5;
 
-/// Settings that the user asked for; they are in [`ORDER`], so that an interrupted compression knows them.
+/// Settings that the user requested; they are in [`ORDER`], so that an interrupted compression can read them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompressJob {
@@ -43,7 +43,7 @@ pub struct CompressJob {
     pub level: u8,
     /// Most dB that training views may lose; 0: no guard.
     pub guard: f64,
-    /// Whether the user said how much is to be pruned: then the guard only warns.
+    /// Whether the user set the share to prune: then the guard only warns.
     pub asked: bool,
     /// Most bytes of the file.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -78,8 +78,8 @@ pub struct CompressOptions {
     pub max_bytes: Option<u64>,
     /// Total steps of fine-tuning. `None`: a share of the run's steps, by level.
     pub fine_tune: Option<usize>,
-    /// Largest loss of training views, dB; beyond it half as much is pruned, at most twice (with `prune`: only a warning). 0:
-    /// no guard.
+    /// Largest loss of training views, dB; beyond it half as much is pruned, at most twice (with `prune`: only a
+    /// warning). 0: no guard.
     pub guard: f64,
     /// Also train the unpruned scene for as many steps, and compare with it.
     pub unpruned: bool,
@@ -146,8 +146,8 @@ impl CompressOptions {
     }
 }
 
-/// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after. Returns the
-/// folder of the result, a run with `scene.s4d` and `report.html`.
+/// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after.
+/// Returns the folder of the result, a run with `scene.s4d` and `report.html`.
 ///
 /// Errors: the run is unfinished or its capture has moved; options that do not fit together; `stop` was raised, after a
 /// checkpoint was saved ([`resume`] continues).
@@ -170,7 +170,8 @@ pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listen
     work.run(options.eval, &options.measure, stop, listener)
 }
 
-/// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure` count.
+/// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure`
+/// count.
 ///
 /// Errors: the folder contains no compression; those of [`compress()`].
 pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
@@ -194,13 +195,13 @@ impl CompressJob {
     }
 }
 
-/// What the first Ctrl-C is answered with while a scene is tuned.
+/// Message for the first Ctrl-C during fine-tuning.
 const SAVING: &str = "stopping: a checkpoint is being saved";
-/// What an owner's record calls this verb.
+/// Name of this verb in an owner's record.
 const COMMAND: &str = "compress";
 
-/// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking, masks) does
-/// not for seconds.
+/// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking,
+/// masks) does not for seconds.
 fn report_polling(event: &Event, kept: &str, console: &dyn Listener) {
     match event {
         Event::Phase { .. } => console.stop_not_polled(kept),
@@ -246,7 +247,7 @@ impl Work {
             let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
             name.push("-compressed");
             let dir = run_folder::free_folder(&source.with_file_name(name));
-            console.say(&format!("the result is written to {}", dir.display()));
+            console.result(&format!("the result is written to {}", dir.display()));
             dir
         });
         Self::place(dir, order, options.force)
@@ -342,7 +343,7 @@ impl Work {
         };
         if let (Some(before), Some(after)) = (before, after) {
             let told = self.compare(&source, &original, [&before, &after], stop, recorded)?;
-            say(&told, self.size, console);
+            print_summary(&told, self.size, console);
             let text = serde_json::to_string_pretty(&told).expect("results are plain data");
             files::write(&self.dir.join(COMPRESS), text.as_bytes())?;
             evaluating::amend(&self.dir, [("notes".into(), json!(recorded.warnings()))])?;
@@ -353,12 +354,12 @@ impl Work {
         Ok(())
     }
 
-    /// What is said where a Ctrl-C ends it.
+    /// Message if Ctrl-C ends it.
     fn kept(&self) -> String {
-        format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
+        format!("finished work is kept: splat4d compress --resume {} continues", in_command(&self.dir))
     }
 
-    /// Everything before and after, measured in one go.
+    /// Scores before and after, measured together.
     fn compare(
         &self,
         source: &Source,
@@ -428,7 +429,7 @@ impl Work {
         };
         let folder = self.dir.join(UNPRUNED);
         files::make_folder(&folder)?;
-        console.say("training the unpruned scene on for as many steps, to compare");
+        console.result("training the unpruned scene for as many more steps, to compare");
         let job = original.job(&settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let done = compress::compress(&job, &folder, &options, stop, &mut |event| {
@@ -449,7 +450,7 @@ impl Work {
             .remedy(format!("Continue with: splat4d compress --resume {}", in_command(&self.dir)))
     }
 
-    /// Where the file must stay within a size, the gentlest settings that do.
+    /// For a size limit, the gentlest settings within it.
     fn choose_size(&mut self, original: &Original<'_>, console: &dyn Listener) -> Result<()> {
         let begun = !checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
         let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };
@@ -466,8 +467,8 @@ impl Work {
             &mut |done, total| console.phase("searching for the size", done, total),
         )?;
         console.clear();
-        let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("what was chosen was tried");
-        console.say(&format!(
+        let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("the chosen one was tried");
+        console.result(&format!(
             "to fit into {}, {:.0} % of the Gaussians are pruned ({} before fine-tuning)",
             files::human_bytes(most),
             100.0 * chosen.prune,
@@ -519,7 +520,7 @@ impl Work {
         Ok(summary)
     }
 
-    /// Whether size or guard want another attempt; then the order is changed, and the folder is ready for it.
+    /// Whether size or guard need another attempt; then the order is changed, and the folder is ready for it.
     fn refused(&mut self, before: &Scores, after: &Scores, bytes: u64, console: &dyn Listener) -> Result<bool> {
         let (Some(was), Some(is)) = (before.train("PSNR"), after.train("PSNR")) else { return Ok(false) };
         let settings = &self.order.settings;
@@ -546,7 +547,7 @@ impl Work {
             }
             return Ok(false);
         }
-        console.say(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
+        console.result(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
         self.order.tried.push(Tried { prune, bytes, psnr: is });
         self.order.settings.prune = next;
         self.folder.clear()?;
@@ -580,7 +581,7 @@ impl Original<'_> {
 
 /// Bytes of a file next to its Gaussians: a poster, cameras, a path.
 const BESIDES: u64 = 48 << 10;
-/// Room that another attempt leaves below the size.
+/// Margin below the size for another attempt.
 const AGAIN_MARGIN: f64 = 0.01;
 
 /// The folder, in that of a compression, of the unpruned scene that was trained on.
@@ -594,7 +595,7 @@ fn steps(run: &Run) -> Vec<Step> {
     let mut out: Vec<Step> = Vec::new();
     let mut before = (0, 0.0);
     for row in &run.metrics {
-        // The row of the very last step stands behind the last stage.
+        // The row of the very last step is behind the last stage.
         if row.stage != DONE && out.last().is_none_or(|s| s.name != row.stage) {
             before = out.iter().fold((0, 0.0), |b, s| (b.0 + s.steps, b.1 + s.seconds));
             out.push(Step { name: row.stage.clone(), ..Step::default() });
@@ -608,7 +609,7 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
+fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
     let fair = told.fair();
     let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
@@ -627,21 +628,21 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
             size[1],
         )
     };
-    console.say(&line(name, fair));
-    console.say(&line("after", &told.after));
+    console.result(&line(name, fair));
+    console.result(&line("after", &told.after));
     if let Some(times) = told.smaller() {
         let faster = told.after.fps / fair.fps;
-        // What would have been shipped otherwise comes first: the plain file, and not the floats of the run.
+        // The alternative comes first: the plain file, and not the floats of the run.
         let plain = told.plain.as_ref().filter(|plain| plain.bytes > 0);
         let plain = plain.map_or_else(String::new, |plain| {
             format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
         });
-        // Floats are never shipped: their figure stands alone only where there is no plain file.
+        // Floats are never shipped: their figure is used only without a plain file.
         let smaller = match plain.is_empty() {
             true => format!("{times:.1} times smaller than 32-bit floats, "),
             false => plain,
         };
-        console.say(&format!("{smaller}{faster:.2} times as fast"));
+        console.result(&format!("{smaller}{faster:.2} times as fast"));
     }
 }
 

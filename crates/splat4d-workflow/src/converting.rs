@@ -61,7 +61,7 @@ pub struct Conversion {
     pub exact: bool,
     /// Positions in the capture's world, in double precision.
     pub world: bool,
-    /// Values of the input to read as they are, not as logarithms, logits or coefficients.
+    /// Values of the input to read unconverted, not as logarithms, logits or coefficients.
     pub linear: Vec<Linear>,
     /// Version of .spz to write.
     pub spz_version: u32,
@@ -70,9 +70,9 @@ pub struct Conversion {
 /// Which way is up in the file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Up {
-    /// As the format has it.
+    /// As in the format.
     Format,
-    /// As the scene has it.
+    /// As in the scene.
     Keep,
     /// This direction.
     Axis([f64; 3]),
@@ -123,7 +123,7 @@ impl Target {
 }
 
 impl Conversion {
-    /// A whole scene as one file, nothing else asked for.
+    /// A whole scene as one file, nothing else requested.
     pub fn new(input: impl Into<PathBuf>, output: impl Into<PathBuf>) -> Self {
         Self {
             input: input.into(),
@@ -164,7 +164,7 @@ pub fn run(args: &Conversion, console: &dyn Listener) -> Result<()> {
     write(args, source, console)
 }
 
-/// Reads values as they are where the options say so.
+/// Reads values unconverted where the options specify it.
 fn read_linear(source: &mut Source, linear: &[Linear]) {
     for &what in linear {
         // The reader's own doubt about them is settled.
@@ -197,7 +197,7 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     Ok((pattern, target))
 }
 
-/// Writes a scene that was opened, as the options say.
+/// Writes an opened scene by the options.
 pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> Result<()> {
     let (pattern, target) = asked(args)?;
     if args.no_provenance {
@@ -206,7 +206,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     if let Some(degree) = args.sh {
         let had = source.scene.limit_sh(degree.into());
         if had > usize::from(degree) {
-            console.say(&format!("spherical harmonics lowered from degree {had} to {degree}"));
+            console.result(&format!("spherical harmonics lowered from degree {had} to {degree}"));
         }
     }
     let cameras = first_camera(&source);
@@ -255,8 +255,8 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let still;
     let whole = match moment {
         Some(time) => {
-            still = one_moment(scene, time)?;
-            console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
+            still = one_time(scene, time)?;
+            console.result(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
             &still
         }
         None => scene,
@@ -274,13 +274,13 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     };
     files::write(&args.output, &bytes)?;
     if let Some(l) = &likeness {
-        console.say(&format!(
+        console.result(&format!(
             "the file against the scene: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
     }
     let each = bytes.len() as f64 / whole.len().max(1) as f64;
-    console.say(&format!(
+    console.result(&format!(
         "{}: {} Gaussians, {} ({each:.1} bytes each)",
         target.name(),
         grouped(whole.len()),
@@ -292,7 +292,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     Ok(())
 }
 
-/// How like the scene a file of it looks.
+/// Similarity of a file to its scene.
 fn like(
     source: &Source,
     dialect: Dialect,
@@ -310,7 +310,7 @@ fn like(
     Ok(likeness)
 }
 
-/// A playback file. The capture's cameras belong to the old axes: a scene that was rotated goes without them.
+/// A playback file. The capture's cameras belong to the old axes: a rotated scene is written without them.
 fn bake(mut source: Source, args: &Conversion, rotated: bool, console: &dyn Listener) -> Result<()> {
     let title = baking::title(&source, &args.input);
     if rotated {
@@ -372,7 +372,7 @@ fn write_frames(
     }
     owned.finished();
     console.clear();
-    console.say(&format!(
+    console.result(&format!(
         "{} files{}, {fps} per second, from {} to {} s, {} in total",
         times.len(),
         constant.as_ref().map(|c| format!(" of {} Gaussians each", grouped(c.len()))).unwrap_or_default(),
@@ -386,7 +386,7 @@ fn write_frames(
     Ok(())
 }
 
-/// Rotates the scene so that the wanted axis is up, and returns the rotation that was made.
+/// Rotates the scene so that the requested axis is up, and returns the rotation that was made.
 fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener) -> [[f64; 3]; 3] {
     let custom = match target {
         Target::Dialect(d) => Some(d.up),
@@ -408,11 +408,11 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
     scene.rotate(&r);
-    console.say(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
+    console.result(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
     r
 }
 
-/// The first camera of the data set, if it is at hand: a place from which the scene looks right.
+/// The first camera of the data set, if it is available: a sensible viewpoint.
 fn first_camera(source: &Source) -> Option<Camera> {
     Some(source.views().ok()?.into_iter().next()?.camera)
 }
@@ -424,7 +424,7 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 }
 
 /// A scene that is static as `scene` is at `time`.
-fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
+fn one_time(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
     layers::moment(scene, Time(time)).map(|params| standing(scene, params))
 }
 
@@ -448,7 +448,7 @@ impl Writer {
                 let mut warnings = dialect.write(scene, &self.options, &mut out)?;
                 if !scene.labels.is_empty() {
                     warnings
-                        .say(format!("{} labels are left out: the format does not support them", scene.labels.len()));
+                        .add(format!("{} labels are left out: the format does not support them", scene.labels.len()));
                 }
                 warnings
             }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// An error where `stop` was raised.
 pub(crate) fn unless_stopped(stop: &AtomicBool) -> Result<()> {
     if stop.load(Ordering::SeqCst) {
-        return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command begins again."));
+        return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again."));
     }
     Ok(())
 }
@@ -28,7 +28,7 @@ impl Default for Deadline {
 }
 
 impl Deadline {
-    /// At so many minutes of a clock; none: never.
+    /// At this many minutes of a clock; none: never.
     pub fn of(clock: Stopwatch, minutes: Option<f64>) -> Self {
         Self { clock, end: minutes.map_or(f64::INFINITY, |m| 60.0 * m) }
     }
@@ -43,7 +43,7 @@ impl Deadline {
         self.end.is_finite()
     }
 
-    /// Seconds of the clock so far.
+    /// Elapsed seconds.
     pub fn now(&self) -> f64 {
         self.clock.seconds()
     }
@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_part_ends_within_what_is_left() {
+    fn a_part_ends_within_the_remaining_time() {
         let clock = Stopwatch::of(|| 30.0);
         assert_eq!(Deadline::of(clock.clone(), Some(1.0)).part(0.2).left(), 6.0);
         assert_eq!(Deadline::of(clock.clone(), Some(0.25)).part(0.2).left(), 0.0, "it is over");

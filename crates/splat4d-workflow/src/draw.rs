@@ -9,7 +9,7 @@ use splat4d::device;
 use splat4d::flow;
 use splat4d::layers::{ALWAYS, Evaluation, Head, Scene};
 use splat4d::play::Player;
-use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Wanted};
+use splat4d::render::{Abilities, Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
 use splat4d::{Error, Result};
 use splat4d_train::labels::best;
@@ -70,7 +70,7 @@ impl Channel {
         }
     }
 
-    /// What it shows.
+    /// Its content.
     pub fn about(self) -> &'static str {
         match self {
             Self::Color => "Colour over the background",
@@ -129,7 +129,7 @@ const RAMP: [[f32; 3]; 6] = [
 /// Turn of the hue from one label to the next, of a whole one: the golden section, so that few labels are far apart and
 /// many never meet.
 const GOLDEN: f32 = 0.618_034;
-/// Most training images that are asked for the uncertainty of a scene, evenly chosen.
+/// Most training images used for the uncertainty of a scene, evenly chosen.
 const WITNESSES: usize = 48;
 
 /// Pixels that a thread turns into bytes at once: enough to amortise the overhead.
@@ -158,7 +158,7 @@ impl Rgb {
     }
 }
 
-/// Draws, on the CPU by default; memory is reused from image to image.
+/// Renders, on the CPU by default; memory is reused from image to image.
 pub struct Painter<'a> {
     player: Player<'a>,
     scene: &'a Scene<f32>,
@@ -166,13 +166,13 @@ pub struct Painter<'a> {
     depth: bool,
     backend: Box<dyn Backend>,
     /// Abilities that the scene needs of a device.
-    wanted: Wanted,
+    abilities: Abilities,
     listener: Option<&'a dyn Listener>,
     /// The last image.
     pub image: Image<f32>,
     bytes: Vec<[u8; 4]>,
     channel: Channel,
-    /// A number a Gaussian, by layer and row, of channels that show one.
+    /// A number per Gaussian, by layer and row, of channels that show one.
     numbers: Vec<Vec<f32>>,
     instant: Evaluation<f32>,
     /// Of the last image: the channel's values and the weight of what has one.
@@ -180,18 +180,18 @@ pub struct Painter<'a> {
 }
 
 impl<'a> Painter<'a> {
-    /// `depth`: whether images of depth will be asked for.
+    /// `depth`: whether images of depth will be requested.
     pub fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
-        let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
+        let abilities = Abilities { head: scene.head != Head::Identity, ..Abilities::default() };
         Self {
             player,
             scene,
             background,
             depth,
             backend,
-            wanted,
+            abilities,
             listener: None,
             image,
             bytes: Vec::new(),
@@ -213,7 +213,7 @@ impl<'a> Painter<'a> {
     ) -> Result<Self> {
         self.channel = channel;
         self.depth |= channel == Channel::Depth;
-        self.wanted.extra = channel.is_field();
+        self.abilities.extra = channel.is_field();
         match channel {
             Channel::Label if self.scene.labels.is_empty() => {
                 return Err(Error::input("the scene has no labels")
@@ -242,14 +242,14 @@ impl<'a> Painter<'a> {
         Ok(self)
     }
 
-    /// The same on another device: `open` gets the limits of the renderer and what the scene needs. A device that fails later is
-    /// reported to `listener`.
+    /// The same on another device: `open` gets the limits of the renderer and what the scene needs. A device that fails
+    /// later is reported to `listener`.
     pub fn on(
         mut self,
-        open: impl FnOnce(RenderConfig, &Wanted) -> Box<dyn Backend>,
+        open: impl FnOnce(RenderConfig, &Abilities) -> Box<dyn Backend>,
         listener: &'a dyn Listener,
     ) -> Self {
-        self.backend = open(*self.backend.config(), &self.wanted);
+        self.backend = open(*self.backend.config(), &self.abilities);
         self.listener = Some(listener);
         self
     }
@@ -259,7 +259,7 @@ impl<'a> Painter<'a> {
         self.backend.name()
     }
 
-    /// Draws into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
+    /// Renders into [`image`](Self::image). A GPU that fails on the way is reported, and the CPU takes over.
     pub fn draw(&mut self, camera: &Camera, time: f64) {
         if self.channel.is_field() {
             return self.draw_field(camera, time);
@@ -273,7 +273,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Draws the means of the channel's numbers into `field`.
+    /// Renders the means of the channel's numbers into `field`.
     fn draw_field(&mut self, camera: &Camera, time: f64) {
         let scene = self.scene;
         // As players do: what is beyond the clip of spans is its end.
@@ -287,9 +287,9 @@ impl<'a> Painter<'a> {
             }
             Channel::Velocity => flow::velocity_columns(scene, &self.instant),
             Channel::Normal => channels::normal_columns(&self.instant, camera),
-            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was asked for"),
+            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was requested"),
             Channel::Feature => {
-                channels::feature_columns(scene, &self.instant).expect("a scene with features was asked for")
+                channels::feature_columns(scene, &self.instant).expect("a scene with features was requested")
             }
             _ => channels::number_columns(&self.instant, &self.numbers),
         };
@@ -304,8 +304,8 @@ impl<'a> Painter<'a> {
     }
 
     /// The numbers of the last image, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
-    /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units a second; unit normals in camera
-    /// axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
+    /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units per second; unit normals in
+    /// camera axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
     pub fn raw(&self) -> Planes<f32> {
         let (values, weight) = &self.field;
         let known = |p: usize| weight.data[p] >= DEPTH_ALPHA;
@@ -340,7 +340,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Draws and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
+    /// Renders and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
     /// [`rgb`](Self::rgb).
     pub fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel == Channel::Color {
@@ -379,10 +379,9 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of
-    /// depth and
-    /// uncertainty from the least on, of flow and velocity the largest length behind 0, of life the whole clip. `None`:
-    /// nothing is seen, or the channel needs no range.
+    /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of depth
+    /// and uncertainty from the least on, of flow and velocity the largest length behind 0, of lifespan the whole clip.
+    /// `None`: nothing is seen, or the channel needs no range.
     pub fn range(&self) -> Option<[f32; 2]> {
         if self.channel == Channel::Life {
             return Some([0.0, (self.scene.clip[1] - self.scene.clip[0]) as f32]);
@@ -410,12 +409,12 @@ impl<'a> Painter<'a> {
     }
 }
 
-/// As recipes say it, for the renderer.
+/// The recipe's value for the renderer.
 pub fn antialias(on: bool) -> Antialias {
     if on { Antialias::On } else { Antialias::Off }
 }
 
-/// Near is bright; even steps of disparity look even.
+/// Near is bright; equal steps of disparity appear equal.
 fn depth_color(depth: f32, [near, far]: [f32; 2]) -> [u8; 3] {
     let (n, f) = (1.0 / near.max(1e-6), 1.0 / far.max(near * 1.0001).max(1e-6));
     ramp((1.0 / depth.max(1e-6) - f) / (n - f))
@@ -429,7 +428,7 @@ fn ramp(share: f32) -> [u8; 3] {
     std::array::from_fn(|k| (RAMP[i][k] * (1.0 - u) + RAMP[i + 1][k] * u).round() as u8)
 }
 
-/// Numbers as colours; what has none is black.
+/// Numbers as colours; undefined ones are black.
 fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb {
     let span = (high - low).max(f32::MIN_POSITIVE);
     let color = |p: usize| -> [u8; 3] {

@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-/// Masks of images that are examined for the subject, at most: each costs a look at the whole scene.
+/// Masks of images that are examined for the subject, at most: each costs one pass over the whole scene.
 const MOST_MASKS: usize = 120;
 /// Held-out images that are compared before and after floaters are removed.
 const COMPARED: usize = 40;
@@ -60,8 +60,8 @@ pub struct EditOptions {
 
 /// Replays edits on a scene and writes the result in the format of the output's extension.
 ///
-/// Errors: a list that cannot be read; nothing to do; a step that fails; an output that cannot be written, in which case the old
-/// file stays.
+/// Errors: a list that cannot be read; nothing to do; a step that fails; an output that cannot be written, in which
+/// case the old file stays.
 ///
 /// ```no_run
 /// use splat4d::edit::Step;
@@ -81,7 +81,7 @@ pub struct EditOptions {
 /// # }
 /// ```
 pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
-    // What cannot be written is better known before the work.
+    // Unwritable outputs are reported before the work.
     if let Some(output) = &options.output {
         converting::check_output(output)?;
     }
@@ -108,12 +108,17 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
     })?;
     console.clear();
     for step in &done {
-        console.say(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
+        console.result(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
     }
     if let Some(text) = &options.count {
-        return say_count(text, &scene, &bring, console);
+        return print_count(text, &scene, &bring, console);
     }
-    console.say(&format!("{} Gaussians of {} in {} layers", grouped(scene.len()), grouped(before), scene.layers.len()));
+    console.result(&format!(
+        "{} Gaussians of {} in {} layers",
+        grouped(scene.len()),
+        grouped(before),
+        scene.layers.len()
+    ));
     console.emit(&json!({"type": "edited", "before": before, "gaussians": scene.len(), "layers": scene.layers.len(),
         "steps": done}));
     source.scene = scene;
@@ -130,22 +135,22 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
 }
 
 /// Reports how many Gaussians a selection holds, and how many of them are visible when.
-fn say_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dyn Listener) -> Result<()> {
+fn print_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dyn Listener) -> Result<()> {
     let [start, end] = scene.clip;
     let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
     times.dedup();
     let (all, seen) = count(&Expr::parse(text)?, scene, &times, context)?;
     console.clear();
-    console.say(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
+    console.result(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
     for (t, n) in times.iter().zip(&seen) {
-        console.say(&format!("{t:>9.3} s  {} visible", grouped(*n)));
+        console.result(&format!("{t:>9.3} s  {} visible", grouped(*n)));
     }
     console.emit(&json!({"type": "count", "selection": text, "gaussians": all, "of": scene.len(),
         "seen": times.iter().zip(&seen).map(|(t, n)| json!([t, n])).collect::<Vec<_>>()}));
     Ok(())
 }
 
-/// Where edits find what they name.
+/// Sources of the data that edits name.
 pub struct Bring<'a> {
     source: &'a Source,
     /// Names of files are relative to this folder, that of the edits.
@@ -244,7 +249,7 @@ impl Context for Bring<'_> {
         let Proposal { selected, pictures, before, after } = found;
         self.console.clear();
         let count = selected.iter().flatten().filter(|f| **f).count();
-        self.console.say(&format!(
+        self.console.result(&format!(
             "floaters: {} of {} Gaussians; {pictures} held-out images: {before:.2} dB with them, {after:.2} dB without",
             grouped(count),
             grouped(scene.len())
@@ -274,7 +279,7 @@ impl Context for Bring<'_> {
     }
 }
 
-/// Gaussians that float, and what held-out images say of it.
+/// Gaussians that float, and what held-out images show about them.
 pub struct Proposal {
     pub selected: Selected,
     /// Images that were compared, and their mean PSNR with and without the floaters, dB.
@@ -284,7 +289,7 @@ pub struct Proposal {
 }
 
 impl Bring<'_> {
-    /// Looks for floaters.
+    /// Searches for floaters.
     ///
     /// Errors: no run with its capture, no held-out views, a strength that is not from 0 to 1.
     pub fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
@@ -342,8 +347,7 @@ pub fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Ed
     edits
 }
 
-/// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there are
-/// some.
+/// Provenance of an edited scene: that of its file, with these edits appended and another text if there are some.
 pub fn provenance(source: &Source, earlier: Option<Provenance>, edits: &Edits, words: Option<String>) -> Provenance {
     let earlier = earlier.unwrap_or_default();
     let print = |run: &Run| run.info.get("capture_fingerprint")?.as_str().map(str::to_owned);
@@ -365,7 +369,7 @@ mod tests {
     use splat4d::math::Se3;
 
     #[test]
-    fn edits_are_toml_and_come_back() {
+    fn edits_round_trip_as_toml() {
         let text = r#"
             version = 1
             scene = "knight"

@@ -1,5 +1,6 @@
-//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same code
-//! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
+//! The work behind `view --edit`: a page sends requests, and a list of edits is replayed, examined, baked and saved, by
+//! the same code as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the
+//! list.
 
 use crate::baking::{Baking, pack_scene};
 use crate::draw::color_rgb;
@@ -18,18 +19,18 @@ use splat4d::math::{Se3, quat, se3};
 use splat4d::render::{Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Intrinsics, Lens, Time};
 use splat4d::{Error, Result};
-use splat4d_serve::EditAnswer;
+use splat4d_serve::EditResponse;
 use std::path::{Component, Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Replayed lists that are kept: undo and redo are then there at once.
 const KEPT: usize = 4;
-/// Most pixels of an image's side that a page may ask for.
+/// Most pixels of an image's side that a page may request.
 const MOST_SIDE: usize = 1280;
 /// Longer side of the image in which depths are looked up, pixels.
 const PICK_SIDE: usize = 240;
-/// Quality of the JPEG that stands in until the scene is baked.
+/// Quality of the JPEG shown until the scene is baked.
 const QUALITY: u8 = 80;
 /// Most selected Gaussians whose places a page gets: more dots cannot be distinguished.
 const POINTS: usize = 3000;
@@ -81,7 +82,7 @@ impl Eye {
     }
 }
 
-/// Where a handle is pulled.
+/// Target of a handle.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Pulled {
@@ -90,23 +91,23 @@ struct Pulled {
     by: [f64; 3],
 }
 
-/// What a page can ask for.
+/// Requests of a page.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
-enum Ask {
-    /// What there is, and the list as it is; `kept`: the list that the page has in its place.
+enum PageRequest {
+    /// The state and the current list; `kept`: the list that the page has instead.
     Open { kept: Option<Vec<Step>> },
     /// The edited scene as an image.
     Show { steps: Vec<Step>, view: Eye, t: f64 },
     /// The edited scene as a playback file.
     Bake { steps: Vec<Step> },
-    /// The list goes into its file.
+    /// Saves the list to its file.
     Save { steps: Vec<Step> },
-    /// Who is selected.
+    /// The selected Gaussians.
     Select { steps: Vec<Step>, select: String, t: f64 },
     /// A selection in words, by what was drawn on the image: corners as x/z and y/z in the camera's axes.
     Pick { steps: Vec<Step>, shape: Shape, corners: Vec<[f64; 2]>, view: Eye, t: f64, through: bool, now: bool },
-    /// Who floats.
+    /// The floaters.
     Floaters { steps: Vec<Step>, strength: f64, t: f64 },
     /// The nodes by which a selection can be bent: their places are meant at second `at`, and shown at `t`.
     Bend { steps: Vec<Step>, select: String, at: f64, t: f64, nodes: usize },
@@ -121,7 +122,7 @@ struct Replayed {
     done: Vec<Done>,
 }
 
-/// What is bent under the hand.
+/// The interactively deformed part.
 struct Bent {
     number: u64,
     dragging: Dragging,
@@ -168,52 +169,52 @@ impl Editor {
         Ok(Self { source, title, file: file.to_owned(), listed, state, bakings: AtomicU64::new(0) })
     }
 
-    /// The edited scene as a playback file, as the list has it at the start; none: the list is empty.
+    /// The edited scene as a playback file, after the initial list; none: the list is empty.
     pub fn start(&self, console: &dyn Listener) -> Result<Option<Vec<u8>>> {
         if self.listed.steps.is_empty() {
             return Ok(None);
         }
         let (scene, done) = self.replayed(&self.listed.steps)?;
         for step in &done {
-            console.say(&format!("{}: {} Gaussians", step.step, files::grouped(step.selected)));
+            console.result(&format!("{}: {} Gaussians", step.step, files::grouped(step.selected)));
         }
         self.bake(&scene, console).map(Some)
     }
 
-    /// Does what a page asks for.
+    /// Does what a page requests.
     ///
-    /// Errors: what is no question, and those of its work; nothing is changed then.
-    pub fn answer(&self, asked: Value) -> Result<EditAnswer> {
-        let ask: Ask = serde_json::from_value(asked)
+    /// Errors: what is no query, and those of its work; nothing is changed then.
+    pub fn answer(&self, asked: Value) -> Result<EditResponse> {
+        let ask: PageRequest = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
-        let told = |told: Value| Ok(EditAnswer { told, scene: None });
+        let told = |told: Value| Ok(EditResponse { told, scene: None });
         match ask {
-            Ask::Open { kept } => told(self.open(kept)),
-            Ask::Show { steps, view, t } => {
+            PageRequest::Open { kept } => told(self.open(kept)),
+            PageRequest::Show { steps, view, t } => {
                 let camera = view.camera()?;
                 let (scene, done) = self.replayed(&steps)?;
                 let mut image = Image::default();
                 draw(&scene, &camera, t, false, &mut image)?;
                 told(json!({ "done": done, "gaussians": scene.len(), "picture": jpeg(&image)? }))
             }
-            Ask::Bake { steps } => {
+            PageRequest::Bake { steps } => {
                 let number = self.bakings.fetch_add(1, Ordering::SeqCst) + 1;
                 let (scene, _) = self.replayed(&steps)?;
                 let bytes = self.bake(&scene, &ignore)?;
-                // Who asked again in the meantime wants to see that.
+                // A repeated request in the meantime must see that.
                 let newest = self.bakings.load(Ordering::SeqCst) == number;
                 if newest {
                     self.lock().shown = steps;
                 }
-                Ok(EditAnswer { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
+                Ok(EditResponse { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
             }
-            Ask::Save { steps } => self.save(steps).and_then(told),
-            Ask::Select { steps, select, t } => {
+            PageRequest::Save { steps } => self.save(steps).and_then(told),
+            PageRequest::Select { steps, select, t } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let selected = self.select(&select, &scene)?;
                 told(held(&select, &scene, &selected, t))
             }
-            Ask::Pick { steps, shape, corners, view, t, through, now } => {
+            PageRequest::Pick { steps, shape, corners, view, t, through, now } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let drawn = Drawn { shape, corners: &corners, through };
                 let words = drawn.words(&scene, &view.small()?, t)?;
@@ -221,7 +222,7 @@ impl Editor {
                 let selected = self.select(&select, &scene)?;
                 told(held(&select, &scene, &selected, t))
             }
-            Ask::Floaters { steps, strength, t } => {
+            PageRequest::Floaters { steps, strength, t } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let found = Bring::new(&self.source, Some(self.file.as_path()), &ignore)?.propose(&scene, strength)?;
                 let mut value = held("", &scene, &found.selected, t);
@@ -229,8 +230,12 @@ impl Editor {
                 value["pictures"] = json!(found.pictures);
                 told(value)
             }
-            Ask::Bend { steps, select, at, t, nodes } => self.bend(&steps, &select, [at, t], nodes).and_then(told),
-            Ask::Pull { number, handles, pins, view } => self.pull(number, handles, &pins, &view).and_then(told),
+            PageRequest::Bend { steps, select, at, t, nodes } => {
+                self.bend(&steps, &select, [at, t], nodes).and_then(told)
+            }
+            PageRequest::Pull { number, handles, pins, view } => {
+                self.pull(number, handles, &pins, &view).and_then(told)
+            }
         }
     }
 
@@ -247,7 +252,7 @@ impl Editor {
             "title": self.title, "file": name, "steps": state.listed, "layers": layers, "clip": scene.clip, "fps": scene.fps,
             // Another page, or this one before it was loaded again, has changed the scene that pages get.
             "stale": stale, "moving": scene.is_moving(), "gaussians": scene.len(),
-            // A playback file's Gaussians are pieces of time, which no node carries through all of it.
+            // A playback file's Gaussians are time segments, which no node carries through the whole clip.
             "drag": self.source.playback.is_none(), "floaters": self.source.run.is_some(),
         })
     }
@@ -308,7 +313,7 @@ impl Editor {
     }
 
     fn save(&self, steps: Vec<Step>) -> Result<Value> {
-        // What cannot be replayed is not written.
+        // Lists that cannot be replayed are not written.
         self.replayed(&steps)?;
         let edits = Edits { scene: Some(self.title.clone()), steps, ..Edits::default() };
         let mut state = self.lock();
@@ -383,7 +388,7 @@ fn rounded(of: &[[f64; 3]]) -> Vec<[f32; 3]> {
     of.iter().map(|x| x.map(|x| x as f32)).collect()
 }
 
-/// What a page gets of a selection.
+/// Response for a selection.
 fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value {
     let [start, end] = scene.clip;
     let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
@@ -476,7 +481,7 @@ mod tests {
             self.editor.answer(asked.clone()).unwrap_or_else(|e| panic!("{asked}: {e}")).told
         }
 
-        /// What is said of what cannot be done; the list is what it was.
+        /// The message for an impossible request; the list is unchanged.
         fn refused(&self, asked: Value) -> String {
             let before = std::fs::read(self.list()).ok();
             let error = self.editor.answer(asked.clone()).map(|a| a.told).expect_err(&asked.to_string()).to_string();
@@ -602,7 +607,8 @@ mod tests {
         assert!(bench.refused(json!({"do": "show", "steps": [], "view": wide, "t": 0.0})).contains("camera"));
     }
 
-    /// What would have taken all memory, or made numbers of none: the server answers, and goes on with the page's steps.
+    /// Requests that would exhaust memory or give invalid numbers: the server responds and continues with the page's
+    /// steps.
     #[test]
     fn excessive_requests_are_refused_and_others_continue() {
         let bench = Bench::new();

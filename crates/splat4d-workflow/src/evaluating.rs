@@ -1,5 +1,5 @@
-//! What follows training: scores and renders of held-out views, the playback file, an orbit film and the report, within what is
-//! left of `--minutes`.
+//! Work after training: scores and renders of held-out views, the playback file, an orbit film and the report, within
+//! what is left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
 use crate::deadline::{Deadline, unless_stopped};
@@ -43,9 +43,10 @@ const ORBIT_FPS_PNG: f64 = 10.0;
 /// Longer side of an animated PNG, pixels.
 const ORBIT_SIDE_PNG: usize = 400;
 
-/// Training steps that take as long as what follows training: a held-out view rendered, measured and written; a frame of the
-/// film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144 frames: 8 s where a
-/// step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any time.
+/// Training steps that take as long as what follows training: a held-out view rendered, measured and written; a frame
+/// of the film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144
+/// frames: 8 s where a step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any
+/// time.
 const HELD_STEPS: f64 = 1.5;
 /// See [`HELD_STEPS`].
 const FILM_STEPS: f64 = 0.5;
@@ -58,10 +59,10 @@ const CUT_STEPS: f64 = 100.0;
 /// Motion models whose motion is straight, or nearly.
 const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 
-/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, drawn and taken back once.
+/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, rendered and backpropagated once.
 const LABEL_STEPS: f64 = 1.0;
 
-/// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
+/// The time of the work after training, in training steps at full size: `--minutes` includes it.
 pub fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
     let masks = frames().filter(|f| f.labels.is_some()).count().min(labels::MOST_PICTURES);
@@ -72,7 +73,7 @@ pub fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let motion = recipe.run.motion;
     let moves = capture.cameras.iter().any(|c| !c.fixed) && capture.timing != Timing::Moment;
     let straight = STRAIGHT.iter().any(|name| motion == *name) || motion == MotionName::AUTO.as_str() && !moves;
-    let samples = ((last - first) * capture.fps.max(bake::LOOKS)).max(0.0);
+    let samples = ((last - first) * capture.fps.max(bake::SAMPLE_RATE)).max(0.0);
     let bake = if straight { BAKE_STEPS } else { CUT_STEPS + SAMPLE_STEPS * samples };
     if only_playback {
         return bake + labels;
@@ -130,15 +131,15 @@ pub fn all(
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
             Err(error) if error.kind() == ErrorKind::Interrupted => return Err(error),
-            // The scene and its scores stand without the film.
+            // The scene and its scores are valid without the film.
             Err(error) => console.warn(&format!("the orbit film was not written: {error}")),
         }
     }
     write_report(run, console)
 }
 
-/// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts once,
-/// and time between commands does not count.
+/// Remaining minutes of a resumed run: the time of earlier commands until the end of training counts once, and time
+/// between commands does not count.
 pub fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     let budget = &run.info["budget"];
     let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);
@@ -164,7 +165,7 @@ impl Times {
         let views = run.views()?;
         let Some(view) = views.iter().find(|v| v.held).or(views.first()) else { return Ok(Self::default()) };
         let mut painter = Painter::new(scene, scene.background, false, false);
-        // The first one makes room.
+        // The first one is a warm-up.
         painter.draw(&view.camera, view.time);
         let began = deadline.now();
         painter.draw(&view.camera, view.time);
@@ -202,7 +203,7 @@ impl Times {
     }
 }
 
-/// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is said and never costs the run.
+/// Bakes the run into `scene.s4d`, at any size. Errors are reported and never fail the run.
 pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
     playback_by(run, &Deadline::default(), console)
 }
@@ -237,8 +238,8 @@ pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> R
     }
 }
 
-/// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the images and
-/// the report.
+/// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the
+/// images and the report.
 ///
 /// Errors: no scene yet; the capture has moved; another command writes the run; `stop` was raised.
 ///
@@ -330,12 +331,12 @@ pub fn scores_on(
         let capture = Arc::new(Capture { background, ..capture.clone() });
         let place = (!judged).then_some(place);
         let scores = measuring.evaluate(&scene, &capture, measured, place, console)?;
-        say_split(&scores, measured, name, console);
+        print_split(&scores, measured, name, console);
     }
     Ok(())
 }
 
-/// Backgrounds with their names; where none are asked for, the capture's own.
+/// Backgrounds with their names; where none are requested, the capture's own.
 pub(crate) fn on_backgrounds<'a>(
     own: Option<[f32; 3]>,
     asked: &[(&'a str, [f32; 3])],
@@ -346,21 +347,21 @@ pub(crate) fn on_backgrounds<'a>(
     }
 }
 
-pub(crate) fn say_split(scores: &Scores, measured: Measured, background: &str, console: &dyn Listener) {
+pub(crate) fn print_split(scores: &Scores, measured: Measured, background: &str, console: &dyn Listener) {
     let on = if background.is_empty() { String::new() } else { format!(" on {background}") };
     let views = match measured {
         Measured::Test => "held-out views",
         Measured::Validation => "validation views",
         Measured::Train => "training views",
     };
-    console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
+    console.result(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
     let entry = &scores.report.results()[scores.report.method()];
     console.emit(&json!({
         "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
     }));
 }
 
-/// Says and writes how far the cameras of a run are from those of a capture that knows.
+/// Reports and writes the distances of a run's cameras from those of a capture with ground truth.
 ///
 /// Errors: captures that cannot be read, or have no cameras in common.
 pub fn trajectory(run: &Path, truth: &Path, console: &dyn Listener) -> Result<()> {
@@ -385,7 +386,7 @@ pub fn trajectory(run: &Path, truth: &Path, console: &dyn Listener) -> Result<()
     if let Some([middle, most]) = found.clock_errors() {
         let _ = write!(words, "; time offsets wrong by {:.2} ms (median), {:.2} ms at most", 1e3 * middle, 1e3 * most);
     }
-    console.say(&words);
+    console.result(&words);
     console.emit(&json!({"type": "trajectory", "results": found.report()}));
     Ok(())
 }
@@ -429,7 +430,7 @@ impl Measuring<'_> {
     }
 }
 
-/// Bins of the histogram of lives.
+/// Bins of the histogram of lifespans.
 const LIFE_BINS: usize = 10;
 
 /// How many Gaussians can be seen for how much of the clip: in tenths, those that are never seen left out.
@@ -443,10 +444,10 @@ fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
     counts
 }
 
-/// Measures tracks in space where the capture comes with true ones.
+/// Measures tracks in space if the capture contains true ones.
 fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Listener) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
-    console.say(&format!(
+    console.result(&format!(
         "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
          times tracked); nearest Gaussian at {:.4} units, {:.4} in the first frame",
         e.points,
@@ -473,7 +474,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
     if let Some(slope) = e.slope {
         let _ = write!(words, ", drift slope {slope:.2}");
     }
-    console.say(&words);
+    console.result(&words);
     if let Some(p) = &e.pictures {
         let mut words = format!(
             "in {} views: median error {:.2} px, {} % within 1, 2, 4, 8, 16 px (mean {:.1} %)",
@@ -488,7 +489,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
         if let Some(right) = p.visibility {
             let _ = write!(words, ", visibility correct for {:.1} %", 100.0 * right);
         }
-        console.say(&words);
+        console.result(&words);
     }
     let pictures = e.pictures.as_ref().map(|p| {
         json!({
@@ -503,7 +504,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
     amend(run, [("point_tracks".into(), entry)])
 }
 
-/// Measures drawn flow where the capture brings some along.
+/// Measures rendered flow where the capture brings some along.
 fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &dyn Listener) -> Result<()> {
     if capture.kind != CaptureKind::Own {
         return Ok(());
@@ -525,7 +526,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
     if let (Some(moving), Some(length)) = (e.moving, e.length) {
         let _ = write!(words, "; in dynamic regions {moving:.3} px of {length:.2}");
     }
-    console.say(&words);
+    console.result(&words);
     let entry = json!({
         "pictures": e.pictures, "held": e.held, "mean": e.mean, "median": e.median, "moving": e.moving,
         "length": e.length, "within_px": e.within, "drawn": e.drawn,
@@ -536,7 +537,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
 /// The report, and the scores on the console.
 pub fn write_report(run: &Path, console: &dyn Listener) -> Result<()> {
     write_page(run, console)?;
-    say_scores(&Run::open(run)?, console);
+    print_scores(&Run::open(run)?, console);
     Ok(())
 }
 
@@ -569,22 +570,22 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
     words.join(", ")
 }
 
-/// Says how far training moved the cameras, the one that went furthest by name.
-pub fn say_refined(run: &Path, console: &dyn Listener) -> Result<()> {
+/// Reports how far training moved the cameras, naming the one that moved most.
+pub fn print_refined(run: &Path, console: &dyn Listener) -> Result<()> {
     if let Some(words) = corrected::read(run)?.and_then(|refined| refined_in_words(&refined)) {
-        console.say(&words);
+        console.result(&words);
     }
     Ok(())
 }
 
 /// The scores in one line.
-fn say_scores(run: &Run, console: &dyn Listener) {
+fn print_scores(run: &Run, console: &dyn Listener) {
     let words = in_words(|key| run.score(key));
     if !words.is_empty() {
-        console.say(&format!("held-out views: {words}"));
+        console.result(&format!("held-out views: {words}"));
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        console.say(&format!("dynamic regions: {:+.2} dB over a static scene ({still:.2} dB)", ours - still));
+        console.result(&format!("dynamic regions: {:+.2} dB over a static scene ({still:.2} dB)", ours - still));
     }
     if let Some(results) = &run.results {
         let still = run.all_results.get(EvalOptions::STILL);

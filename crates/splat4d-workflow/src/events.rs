@@ -1,4 +1,4 @@
-//! What workflows report while they work, and who listens.
+//! Events of workflows, and their listeners.
 
 use serde_json::Value;
 use splat4d_train::capture::Capture;
@@ -27,7 +27,7 @@ pub enum Event<'a> {
     Result(&'a str),
     /// A result, for machines.
     Record(&'a Value),
-    /// A detail, a sentence for people who asked for more.
+    /// A detail, a sentence for people who requested more.
     Detail(&'a str),
     /// A warning, a sentence.
     Warning(&'a str),
@@ -42,12 +42,12 @@ pub enum Event<'a> {
         /// The capture; none: that of the run, which is continued.
         capture: Option<&'a Arc<Capture>>,
     },
-    /// An event of training or evaluation. Its warnings come as [`Warning`](Self::Warning).
+    /// An event of training or evaluation. Its warnings are sent as [`Warning`](Self::Warning).
     Training(&'a Training),
     /// From here on the workflow polls its stop flag; the sentence states what it does when the flag is raised.
     StopPolled(&'a str),
-    /// From here on the workflow does not poll its stop flag. Ending the process loses nothing, because files are renamed into
-    /// place; the sentence states what is kept and how to continue.
+    /// From here on the workflow does not poll its stop flag. Ending the process loses nothing, because files are
+    /// renamed into place; the sentence states what is kept and how to continue.
     StopNotPolled(&'a str),
 }
 
@@ -56,7 +56,8 @@ pub trait Listener {
     /// Takes an event.
     fn on_event(&self, event: &Event<'_>);
 
-    /// How often it wants the scene during training ([`Training::Snapshot`]); none: never. Asked after [`Event::Begun`].
+    /// How often it needs the scene during training ([`Training::Snapshot`]); none: never. Asked after
+    /// [`Event::Begun`].
     fn snapshots(&self) -> Option<Duration> {
         None
     }
@@ -80,7 +81,7 @@ impl dyn Listener + '_ {
         self.on_event(&Event::PhaseEnded);
     }
 
-    pub(crate) fn say(&self, text: &str) {
+    pub(crate) fn result(&self, text: &str) {
         self.on_event(&Event::Result(text));
     }
 
@@ -127,7 +128,7 @@ impl<'a> Recorded<'a> {
         Self { listener, warnings: RefCell::default() }
     }
 
-    /// The warnings so far.
+    /// The present warnings.
     pub(crate) fn warnings(&self) -> Vec<String> {
         self.warnings.borrow().clone()
     }
@@ -182,7 +183,7 @@ pub fn linked(text: &str) -> String {
     while let Some(at) = rest.find(FOLDER) {
         let name = at + FOLDER.len();
         let end = rest[name..].find(|c: char| !(c.is_ascii_lowercase() || c == '-')).map_or(rest.len(), |n| name + n);
-        // A path that the user gave stands at the beginning or behind another folder.
+        // A path that the user gave is at the beginning or behind another folder.
         let ours = rest[..at].ends_with([' ', '(']) && rest[end..].starts_with(".md");
         out += &rest[..at];
         out += if ours { concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/") } else { "" };
@@ -219,7 +220,7 @@ mod tests {
         let recorded = Recorded::new(&count);
         let listener: &dyn Listener = &recorded;
         listener.event(&Training::Warning { message: "one".into() });
-        listener.say("no warning");
+        listener.result("no warning");
         assert_eq!((recorded.warnings(), *passed.borrow()), (vec!["one".to_owned()], 2));
     }
 
@@ -230,7 +231,7 @@ mod tests {
         let listener: &dyn Listener = &listen;
         listener.phase("baking", 1, 2);
         listener.warn("too dark");
-        (&ignore as &dyn Listener).say("nobody hears it");
+        (&ignore as &dyn Listener).result("nobody hears it");
         assert_eq!(*seen.borrow(), ["Phase { name: \"baking\", done: 1, total: 2 }", "Warning(\"too dark\")"]);
     }
 }

@@ -1,5 +1,5 @@
-//! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and paths of
-//! its Gaussians, or of requested points, as JSON or CSV.
+//! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and
+//! paths of its Gaussians, or of requested points, as JSON or CSV.
 
 use crate::events::Listener;
 use crate::files;
@@ -44,7 +44,7 @@ impl Frames {
 pub struct TrackOptions {
     /// The times.
     pub frames: Frames,
-    /// Every so many Gaussians; 0 counts as 1.
+    /// Every n Gaussians; 0 counts as 1.
     pub every: usize,
     /// Only the Gaussians nearest to this point at the first time, and how many.
     pub near: Option<([f64; 3], usize)>,
@@ -70,7 +70,8 @@ pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
     Ok(source)
 }
 
-/// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence of ours.
+/// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence
+/// of ours.
 ///
 /// Errors: times outside the clip; a folder with other files; a file cannot be written.
 pub fn frames(
@@ -92,7 +93,7 @@ pub fn frames(
     owned.finished();
     listener.clear();
     let (from, to) = (times[0], times[times.len() - 1]);
-    listener.say(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
+    listener.result(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
     listener.written(folder);
     Ok(times.len())
 }
@@ -108,7 +109,8 @@ fn is_json(out: &Path) -> Result<bool> {
     }
 }
 
-/// Writes positions over time of points that the file `points` lists (pixels of cameras, or positions), and their visibility.
+/// Writes positions over time of points that the file `points` lists (pixels of cameras, or positions), and their
+/// visibility.
 ///
 /// Errors: a list that cannot be read; more numbers than a file should have.
 pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, listener: &dyn Listener) -> Result<()> {
@@ -131,7 +133,7 @@ pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, liste
         ));
     }
     files::write(out, if json { result.to_json() } else { result.to_csv() }.as_bytes())?;
-    listener.say(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
+    listener.result(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
     listener.emit(&json!({
         "type": "exported", "points": result.len(), "moments": times.len(), "missing": result.missing(),
     }));
@@ -172,14 +174,14 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     let offset = if options.world { scene.offset } else { [0.0; 3] };
     let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
     files::write(out, text.as_bytes())?;
-    listener.say(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
+    listener.result(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
     listener.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     listener.written(out);
     Ok(())
 }
 
-/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the capture's world,
-/// in double precision.
+/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the
+/// capture's world, in double precision.
 pub fn moment(scene: &Scene<f32>, time: f64, world: bool, out: &Path) -> Result<usize> {
     let params = freeze(scene, Time(time))?;
     let mut bytes = Vec::new();
@@ -188,7 +190,7 @@ pub fn moment(scene: &Scene<f32>, time: f64, world: bool, out: &Path) -> Result<
     Ok(params.len())
 }
 
-/// Says that a file of one time is empty, where it is.
+/// Reports if a file of one time is empty.
 pub fn warn_of_empty(scene: &Scene<f32>, time: f64, count: usize, listener: &dyn Listener) {
     if count == 0 {
         listener.warn(&format!(
@@ -214,7 +216,7 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
             .at(link.display())
             .remedy("Use option `link` NAME.s4d."));
     }
-    // A playback file may be next to its page as it is.
+    // A playback file may be next to its page unchanged.
     let is_read = |link: &&Path| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
     if let Some(link) = link.filter(|link| !is_read(link)) {
         keep(path, run.as_ref(), link, &[])?;
@@ -229,10 +231,10 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
         listener.written(link);
     }
     files::write(out, html.as_bytes())?;
-    listener.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
+    listener.result(&format!("a page of {}", files::human_bytes(html.len() as u64)));
     listener.written(out);
     if link.is_some() {
-        listener.say("put both on a web server: browsers do not let a page opened from disk read another file");
+        listener.result("put both on a web server: browsers do not let a page opened from disk read another file");
     }
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! Any scene, of a run or of another program, scored on the views of a capture.
 
-use crate::evaluating::{Measure, on_backgrounds, say_split};
+use crate::evaluating::{Measure, on_backgrounds, print_split};
 use crate::events::Listener;
 use crate::source::{Source, not_empty};
 use splat4d::layers::Scene;
@@ -28,7 +28,7 @@ pub struct ForeignOptions<'a> {
     pub force: bool,
     /// The split to measure.
     pub measured: Measured,
-    /// What transparent pixels are composited on, by name. None: the capture's own background.
+    /// Background of transparent pixels, by name. None: the capture's own background.
     pub backgrounds: &'a [(&'a str, [f32; 3])],
 }
 
@@ -40,7 +40,8 @@ impl Default for ForeignOptions<'_> {
 
 /// Scores any scene (a file, numbered files, a run) on the views of a capture.
 ///
-/// Errors: the capture has no such views; images without alpha, which are composited on nothing; no scene; `stop` was raised.
+/// Errors: the capture has no such views; images without alpha, which are composited on nothing; no scene; `stop` was
+/// raised.
 pub fn score(
     path: &Path,
     capture: &Path,
@@ -92,7 +93,8 @@ pub fn score(
     Ok(())
 }
 
-/// Scores a scene that is no run's on views of a capture, and writes scores and images into `out`, if there is such a folder.
+/// Scores a scene that is not a run's on views of a capture, and writes scores and images into `out`, if there is such
+/// a folder.
 ///
 /// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
 #[allow(clippy::too_many_arguments)]
@@ -142,7 +144,7 @@ fn foreign_scores(
             None => assess(&scene, &capture, &store, 0, &options, stop, &mut listen)?,
         };
         console.clear();
-        say_split(&scores, measured, name, console);
+        print_split(&scores, measured, name, console);
     }
     Ok(())
 }

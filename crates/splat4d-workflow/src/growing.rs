@@ -1,5 +1,5 @@
-//! The playback file of a long capture: parts are appended as they are finished, so that it plays as far as it goes; at the end it
-//! is written again as any other file.
+//! The playback file of a long capture: parts are appended as they are finished, so that its present part plays; at the
+//! end it is written again as any other file.
 
 use crate::baking::{self, Baking, Outline, bake_like, poster};
 use crate::deadline::Deadline;
@@ -86,7 +86,7 @@ fn grows(path: &Path) -> Result<bool> {
     Ok(Index::place(&header).is_err() || Index::grows(&header))
 }
 
-/// Appends what is missing, in time; `thorough`: and looks whether what is there is of the chunks that are there.
+/// Appends what is missing, in time; `thorough`: and checks that its parts match the existing chunks.
 fn append_to(
     path: &Path,
     run: &Path,

@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The file by which a capture is recognised.
 const CAPTURE: &str = "capture.json";
-/// What an import writes into its folder, in addition to its corrections.
+/// Files that an import writes into its folder, in addition to its corrections.
 const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
 /// Findings of the doctor that the text contains; its page has all.
 const MOST: usize = 6;
@@ -27,17 +27,17 @@ const MOST: usize = 6;
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct Imported {
-    /// What was found of each camera.
+    /// Results of each camera.
     pub report: Report,
     /// Findings of the doctor and its page, where it was called.
     pub checked: Option<(Checked, PathBuf)>,
 }
 
-/// Makes a capture of videos or folders of images: frames, synchronization, poses, lenses and points. `check`: examines the finished
-/// capture too and writes `import/doctor.html`. The same request continues interrupted work.
+/// Makes a capture of videos or folders of images: frames, synchronization, poses, lenses and points. `check`: examines
+/// the finished capture too and writes `import/doctor.html`. The same request continues interrupted work.
 ///
-/// Errors: the folder contains a capture of another program; videos that cannot be read; poses that cannot be found; `stop` was
-/// raised.
+/// Errors: the folder contains a capture of another program; videos that cannot be read; poses that cannot be found;
+/// `stop` was raised.
 ///
 /// ```no_run
 /// use splat4d_import::recording::Request;
@@ -79,7 +79,7 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     Ok(Imported { report, checked })
 }
 
-/// What the user should know of cameras.
+/// Messages about cameras.
 fn warnings(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     for camera in &report.cameras {
@@ -152,7 +152,8 @@ impl Imported {
     }
 }
 
-/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never replaced.
+/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never
+/// replaced.
 fn check_ours(folder: &Path) -> Result<()> {
     if folder.join(corrections::FILE).is_file() {
         return Ok(());

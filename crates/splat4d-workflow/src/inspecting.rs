@@ -41,15 +41,15 @@ const MANY_FAINT: f64 = 0.5;
 const HUGE: f64 = 1.0;
 /// Share of huge Gaussians that is not healthy.
 const MANY_HUGE: f64 = 0.02;
-/// Below this many Gaussians shares say nothing.
+/// Below this many Gaussians shares carry no information.
 const FEW: usize = 100;
-/// Layers that are listed; playback files have one a page, and their sections are printed already.
+/// Layers that are listed; playback files have one per page, and their sections are printed already.
 const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
-/// What readers say of values that cannot be right as they were read; all else that they say is a note. Base colours that are all
-/// bright may be those of a bright scene.
+/// Remarks of readers about values that cannot be right; all other remarks are notes. Base colours that are all bright
+/// may be those of a bright scene.
 const DOUBTS: [&str; 8] = [
     "--linear scales",
     "--linear opacities",
@@ -70,7 +70,7 @@ pub struct InspectOptions {
     pub doctor: Option<PathBuf>,
 }
 
-/// What a capture, a run or a file contains.
+/// Content of a capture, a run or a file.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Inspection {
@@ -78,7 +78,7 @@ pub struct Inspection {
     pub json: Value,
     /// The same for people, in lines.
     pub text: String,
-    /// Why it does not look healthy.
+    /// Reasons why it does not look healthy.
     pub troubles: Vec<String>,
     /// More reasons, which `text` contains already.
     pub listed: Vec<String>,
@@ -140,7 +140,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
-    // What is next to images is noted even where this recipe does not use it.
+    // Files next to images are listed even if this recipe does not use them.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
     let priors = priors(&capture);
@@ -220,7 +220,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
             Severity::Note => line(&mut text, "note", &sentence(finding)),
         }
     }
-    // One block: what was not found, not read, assumed or not checked; warnings come first.
+    // One block: content not found, not read, assumed or not checked; warnings first.
     for (name, aspect) in Aspect::ALL {
         let mut of: Vec<&Finding> = findings.iter().filter(|f| f.aspect == Some(aspect)).collect();
         of.sort_by_key(|f| std::cmp::Reverse(f.severity));
@@ -302,7 +302,7 @@ fn in_short(names: &[&str]) -> String {
     }
 }
 
-/// What is next to the images, in words.
+/// Files next to the images, as text.
 fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
     type Has = fn(&Frame) -> bool;
@@ -362,7 +362,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
             let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
             line(&mut text, "recipe", &format!("{}; {choices}", recipe.run.motion));
         }
-        // Its owner has taken the folder this very moment.
+        // Its owner has just taken the folder.
         Err(_) if run.recipe.is_none() && owner.is_some() => line(&mut text, "recipe", "not written yet"),
         Err(e) => return Err(e),
     }

@@ -107,7 +107,7 @@ fn learn_features(
     };
     if let Some(scores) = scores {
         let channels = scene.feature_channels();
-        console.say(&format!(
+        console.result(&format!(
             "{channels} feature channels: {:.1} % of the variance of {} {views} views explained, mean cosine {:.3}",
             100.0 * scores.explained,
             scores.pictures,
@@ -145,7 +145,7 @@ fn learn_labels(
         None => (measure(scene, capture, &capture.train)?, "training"),
     };
     if let Some(scores) = &scores {
-        console.say(&in_words(scores, views));
+        console.result(&in_words(scores, views));
         amend(
             run,
             [(
@@ -162,7 +162,7 @@ fn learn_labels(
     all.flatten().for_each(|k| counts[k] += 1);
     let gaussians: Vec<String> =
         scene.labels.iter().zip(&counts).map(|(name, n)| format!("{name} {}", files::grouped(*n))).collect();
-    console.say(&format!("Gaussians: {}", gaussians.join(", ")));
+    console.result(&format!("Gaussians: {}", gaussians.join(", ")));
     console.emit(&json!({
         "type": "labelled", "labels": scene.labels, "gaussians": counts, "most_pictures": labels::MOST_PICTURES,
     }));

@@ -1,6 +1,6 @@
-//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: import, inspect, train, open runs
-//! and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label, predict, edit and report. Functions take typed options, report
-//! [`events::Event`]s and print nothing.
+//! The work of the `splat4d` command without parsing and printing, as functions for Rust and Python: import, inspect,
+//! train, open runs and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label,
+//! predict, edit and report. Functions take typed options, report [`events::Event`]s and print nothing.
 //!
 //! ```no_run
 //! use splat4d_workflow::baking::{self, Baking};
@@ -36,12 +36,12 @@
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `converting.rs`, `exporting.rs` | formats of other programs; .ply files, a page, tracks |
 //! | `localising.rs` | pose and time of images |
-//! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, drawn without a library; tables |
+//! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
-//! | `predicting.rs`, `predicting/` | forecasts, compared with what came |
+//! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 

@@ -11,7 +11,7 @@ use splat4d::render::Antialias;
 use splat4d::scene::{Camera, Intrinsics, Planes};
 use splat4d::{Error, Result};
 use splat4d_train::capture::Rgb8;
-use splat4d_train::eval::localise::{self, Located, Question, SURE};
+use splat4d_train::eval::localise::{self, Located, Query, SURE};
 use std::path::{Path, PathBuf};
 
 /// Largest difference of the shapes (width over height) of an image and a start's.
@@ -31,8 +31,8 @@ pub struct LocaliseOptions {
 /// Finds pose and time of images (JPEG, PNG or WebP) of a scene, each independently; returns the cameras as entries of
 /// `cameras.json`, in the order of the images.
 ///
-/// Errors: an image was not found, after all of them were tried and those found were written; files that cannot be read; a scene
-/// file without start cameras; an image whose shape is not that of a start.
+/// Errors: an image was not found, after all of them were tried and those found were written; files that cannot be
+/// read; a scene file without start cameras; an image whose shape is not that of a start.
 ///
 /// ```no_run
 /// use splat4d_workflow::localising::{LocaliseOptions, localise};
@@ -60,19 +60,19 @@ pub fn localise(
     let starts = starts(scene, options.start.as_deref(), &source)?;
     let recipe = source.run.as_ref().and_then(|run| run.recipe().ok());
     let antialias = if recipe.is_some_and(|r| r.appearance.antialias) { Antialias::On } else { Antialias::Off };
-    let question = Question { antialias, lens: options.lens };
+    let query = Query { antialias, lens: options.lens };
     let (mut found, mut lost): (Vec<Value>, Vec<String>) = (Vec::new(), Vec::new());
     for path in images {
         let picture = read(path)?;
         let cameras = resized(&starts, &picture).map_err(|e| e.at(path.display()))?;
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        let located = localise::localise(&source.scene, &picture, &cameras, question, &mut |done, all| {
+        let located = localise::localise(&source.scene, &picture, &cameras, query, &mut |done, all| {
             console.phase(&format!("localising {name}"), done, all);
         })?;
         console.clear();
         let row = row(&located, &name, found.len());
         if located.is_sure() {
-            console.say(&in_words(&located, &name));
+            console.result(&in_words(&located, &name));
             console.emit(&json!({"type": "located", "picture": path.to_string_lossy(), "camera": row}));
             found.push(row);
         } else {
@@ -99,7 +99,7 @@ pub fn localise(
     .remedy("Give a camera nearer to it with option `start`."))
 }
 
-/// Where to begin.
+/// Start cameras.
 fn starts(scene: &Path, start: Option<&Path>, source: &Source) -> Result<Vec<View>> {
     let mut views = match (start, &source.run) {
         (Some(path), _) => match views_in(path)? {

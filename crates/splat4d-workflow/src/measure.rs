@@ -1,6 +1,6 @@
-//! How a scene plays on this machine's CPU: who is alive, how many bytes, frames a second drawn from the capture's own
-//! cameras over its clip. What is compared is measured in turns, image by image, so that a machine that is busy
-//! for a while slows all of them.
+//! How a scene plays on this machine's CPU: who is alive, how many bytes, frames per second rendered from the capture's
+//! own cameras over its clip. Compared variants are measured alternately, image by image, so that a machine that is
+//! busy for a while slows all of them.
 
 use crate::draw::color_into;
 use crate::paths::View;
@@ -23,12 +23,12 @@ use std::time::Instant;
 /// Width and height of the images by default: the frame rates of docs/benchmarks.md are at this size.
 pub const SIZE: [usize; 2] = [800, 800];
 /// Images of a round: enough that every side of the scene and all parts of the clip take part.
-const LOOKS: usize = 24;
-/// Rounds of which the best of every image counts, after one that makes room.
+const VIEWS: usize = 24;
+/// Rounds of which the best of every image counts, after a warm-up round.
 const ROUNDS: usize = 5;
-/// Times that the first image is drawn from bytes; the best counts.
+/// Times that the first image is rendered from bytes; the best counts.
 const DECODES: usize = 3;
-/// Most times at which Gaussians are counted: ten seconds at 30 frames a second.
+/// Most times at which Gaussians are counted: ten seconds at 30 frames per second.
 const COUNTED: usize = 300;
 
 /// One side of a comparison. Its JSON is part of `compress.json` and of what `bench --playback` prints.
@@ -41,14 +41,14 @@ pub struct Side {
     pub active_max: usize,
     /// Of the file: a playback file, or the scene file with its 32-bit floats.
     pub bytes: u64,
-    /// `bytes` over the clip's length, 10⁶ bits a second; `None` for a clip without length.
+    /// `bytes` over the clip's length, 10⁶ bits per second; `None` for a clip without length.
     pub mbit_per_s: Option<f64>,
     /// Four bytes for every number of every table.
     pub float_bytes: u64,
     /// Means over the held-out views, dB; `None` where they were not measured or are not defined.
     pub psnr: Option<f64>,
     pub ssim: Option<f64>,
-    /// Where things move, dB.
+    /// Of dynamic regions, dB.
     pub psnr_dynamic: Option<f64>,
     /// Mean difference between the change from frame to frame and the truth's, in 1/255.
     pub flicker: Option<f64>,
@@ -56,7 +56,7 @@ pub struct Side {
     pub psnr_train: Option<f64>,
     /// Images a second of the blend stage alone.
     pub raster_fps: f64,
-    /// Images a second end to end: who is alive, motion, drawing, 8-bit colours.
+    /// Images a second end to end: who is alive, motion, rendering, 8-bit colours.
     pub fps: f64,
     /// From bytes in memory to the first image, milliseconds.
     pub decode_ms: f64,
@@ -87,13 +87,13 @@ impl Side {
 /// Scene or file that is measured.
 #[derive(Clone, Debug)]
 pub enum What<'a> {
-    /// A scene in memory, with its 32-bit floats; played as it is.
+    /// A scene in memory, with its 32-bit floats; played unchanged.
     Scene(&'a Scene<f32>),
     /// The bytes of a playback file; played page by page.
     File(Arc<[u8]>),
 }
 
-/// Scene or file that is measured, and how it must be drawn.
+/// Scene or file that is measured, and how it must be rendered.
 #[derive(Clone, Debug)]
 pub struct Subject<'a> {
     pub what: What<'a>,
@@ -115,8 +115,8 @@ pub fn measured_views_of(source: &Source, size: [usize; 2]) -> Result<Vec<Measur
     }
     let stage = source.stage(&views);
     let orbit =
-        |i: usize| View { camera: stage.orbit(i as f64 / LOOKS as f64), name: i.to_string(), time: 0.0, held: false };
-    Ok(measured_views(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
+        |i: usize| View { camera: stage.orbit(i as f64 / VIEWS as f64), name: i.to_string(), time: 0.0, held: false };
+    Ok(measured_views(&(0..VIEWS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
 /// Times in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
@@ -128,13 +128,13 @@ pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2
     let look = |i: usize| {
         let camera = cameras[i * step % cameras.len()];
         let fov_y = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
-        let time = clip[0] + (clip[1] - clip[0]) * (i as f64 + 0.5) / LOOKS as f64;
+        let time = clip[0] + (clip[1] - clip[0]) * (i as f64 + 0.5) / VIEWS as f64;
         MeasuredView { camera: Camera::with_fov_y(camera.cam_from_world, fov_y, width, height), time: Time(time) }
     };
-    (0..LOOKS).map(look).collect()
+    (0..VIEWS).map(look).collect()
 }
 
-/// From camera to camera: about the golden section of the rig, so that neighbours in time look from elsewhere, and
+/// From camera to camera: about the golden section of the rig, so that neighbours in time differ in viewpoint, and
 /// coprime to their number, so that all take part.
 fn stride(cameras: usize) -> usize {
     const GOLDEN: f64 = 0.382;
@@ -148,8 +148,8 @@ fn stride(cameras: usize) -> usize {
     (first..).find(|s| gcd(*s, cameras) == 1).expect("a number above the cameras' is coprime to theirs")
 }
 
-/// Measures all subjects in turns, with all threads of the current pool; one [`Side`] each, without scores.
-/// Panics: no looks.
+/// Measures all subjects alternately, with all threads of the current pool; one [`Side`] each, without scores.
+/// Panics: no samples.
 ///
 /// Errors: those of the file.
 pub fn in_turns(
@@ -157,7 +157,7 @@ pub fn in_turns(
     measured_views: &[MeasuredView],
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<Side>> {
-    assert!(!measured_views.is_empty(), "a measurement needs something to look at");
+    assert!(!measured_views.is_empty(), "a measurement needs at least one view");
     let mut seats = subjects.iter().map(|s| Seat::new(s, measured_views.len())).collect::<Result<Vec<_>>>()?;
     let total = DECODES + ROUNDS + 1;
     for round in 0..DECODES {
@@ -187,13 +187,13 @@ pub fn in_turns(
 struct Seat<'a> {
     side: Side,
     player: Player<'a>,
-    /// Stored bytes that a first image is drawn from.
+    /// Stored bytes that a first image is rendered from.
     stored: Arc<[u8]>,
     background: [f32; 3],
     renderer: Renderer<f32>,
     image: Image<f32>,
     rgb: Vec<u8>,
-    /// Seconds of the blend stage and of the whole image, by look.
+    /// Seconds of the blend stage and of the whole image, by image.
     best: Vec<[f64; 2]>,
     decode_ms: f64,
     pairs: f64,
@@ -224,7 +224,7 @@ impl<'a> Seat<'a> {
         })
     }
 
-    /// Draws one image; seconds of the blend stage and of all.
+    /// Renders one image; seconds of the blend stage and of all.
     fn draw(&mut self, look: &MeasuredView) -> Result<[f64; 2]> {
         let clock = Instant::now();
         let splats = self.player.at(look.time)?;
@@ -237,7 +237,7 @@ impl<'a> Seat<'a> {
     fn side(mut self) -> Result<Side> {
         let counts = frames(self.player.meta().clip, self.player.meta().fps)
             .into_iter()
-            // The pages of a time come into memory with its image.
+            // The pages of a time are loaded with its image.
             .map(|t| self.player.at(t).map(|_| ()).map(|()| self.player.alive(t)))
             .collect::<Result<Vec<usize>>>()?;
         let rate = |k: usize| self.best.len() as f64 / self.best.iter().map(|b| b[k]).sum::<f64>().max(f64::EPSILON);

@@ -1,4 +1,4 @@
-//! Shapes that are drawn over an image, as selections in words.
+//! Shapes drawn over an image, as text of selections.
 
 use serde::Deserialize;
 use splat4d::device;
@@ -17,21 +17,22 @@ const FAINT: f32 = 0.1;
 const SEEN: f32 = 0.5;
 /// Share of the nearest visible depth by which a selection reaches towards the camera.
 const MARGIN: f64 = 0.05;
-/// Distance of colours that look alike, 0 to 1.
+/// Distance of similar colours, 0 to 1.
 const ALIKE: f64 = 0.12;
 /// Farther than this nothing is searched for, scene units.
 const ENDLESS: f64 = 1e6;
 /// Most corners that a page may draw.
 const CORNERS: usize = 256;
-/// Share of a drawn shape's narrower side by which a selection without *Through* reaches behind the first visible surface:
-/// half of it holds an object about as deep as it is wide, drawn around with some room, and nothing that stands behind.
+/// Share of a drawn shape's narrower side by which a selection without *Through* reaches behind the first visible
+/// surface: half of it holds an object about as deep as it is wide, drawn around with some room, and nothing that is
+/// behind.
 const BEHIND_SURFACE: f64 = 0.5;
 /// Most cells along a side of the stored depth map: its text stays below 5 kB.
 const MOST_CELLS: usize = 24;
 /// Least side of a cell, pixels of the image in which depths are looked up.
 const CELL: f64 = 2.0;
 
-/// What was drawn on the image.
+/// The shape drawn on the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Shape {
@@ -41,7 +42,7 @@ pub(crate) enum Shape {
     Color,
 }
 
-/// Renders a scene at a time, with depths where they are asked for.
+/// Renders a scene at a time, with depths where they are requested.
 pub(crate) fn draw(scene: &Scene<f32>, camera: &Camera, t: f64, depth: bool, image: &mut Image<f32>) -> Result<()> {
     let mut player = Player::of_scene(scene);
     let splats = player.at(Time(t.clamp(scene.clip[0], scene.clip[1])))?;
@@ -73,7 +74,7 @@ pub(crate) fn there(scene: &Scene<f32>, t: f64, which: impl Fn(usize, usize) -> 
     out
 }
 
-/// What was drawn on the image.
+/// The shape drawn on the image.
 pub(crate) struct Drawn<'a> {
     pub shape: Shape,
     pub corners: &'a [[f64; 2]],
@@ -198,9 +199,9 @@ impl Drawn<'_> {
 
 /// The first visible surface within a shape, as a coarse depth map.
 ///
-/// `sides` are the shape's ranges of x/z and y/z; `k` the intrinsics of the image; `narrow` the shape's narrower side, x/z;
-/// `seen` the image points that show something, with their depths. A cell takes the nearest depth in it, so that nothing
-/// behind an outline is selected.
+/// `sides` are the shape's ranges of x/z and y/z; `k` the intrinsics of the image; `narrow` the shape's narrower side,
+/// x/z; `seen` the image points that show something, with their depths. A cell takes the nearest depth in it, so that
+/// nothing behind an outline is selected.
 fn first_surface(
     eye: [f64; 3],
     turn: [f64; 4],

@@ -1,5 +1,5 @@
-//! Anything that can be played, as a playback file: one as it is; a run's, if it is not older than its scene; any other
-//! scene baked in memory.
+//! Anything that can be played, as a playback file: one unchanged; a run's, if it is not older than its scene; any
+//! other scene baked in memory.
 
 use crate::baking::{Baking, pack, title};
 use crate::events::Listener;

@@ -1,4 +1,4 @@
-//! Points that users ask for: a file of pixels or places, followed through a scene, and who sees them.
+//! Points that users request: a file of pixels or positions, followed through a scene, and their visibility.
 
 use crate::paths::View;
 use splat4d::flow::query::{Followed, Place, PointView, Query, follow, sights};
@@ -17,7 +17,7 @@ pub struct PointQuery {
     camera: Option<String>,
 }
 
-/// What the columns of a file mean.
+/// Columns of a file.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Column {
     Camera,
@@ -28,15 +28,15 @@ enum Column {
 }
 
 fn remedy() -> String {
-    "The first line names the columns: camera,x,y,time for pixels, or time,x,y,z for points, with camera where its \
-     visibility is wanted."
+    "The first line names the columns: camera,x,y,time for pixels, or time,x,y,z for points, \
+     with camera where its visibility is needed."
         .into()
 }
 
-/// Reads points. `views` are the cameras that the scene's file knows.
+/// Reads points. `views` are the cameras of the scene's file.
 ///
-/// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is not
-/// there, a pixel outside of its image, a time outside of the clip.
+/// Errors, with the line's number: columns that are unknown, missing or duplicate, an invalid number, a camera that is
+/// not there, a pixel outside of its image, a time outside of the clip.
 pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<PointQuery>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (_, header) = lines.next().ok_or_else(|| Error::input("the file of points is empty").remedy(remedy()))?;
@@ -141,7 +141,7 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
-    /// Follows points to some times. `progress` hears how many times of how many are done.
+    /// Follows points to some times. `progress` is called with the finished and the total number of times.
     pub fn of(
         scene: &Scene<f32>,
         asked: Vec<PointQuery>,
@@ -174,7 +174,7 @@ impl QueryResult {
         self.followed.starts.iter().filter(|s| s.is_none()).count()
     }
 
-    /// Points that were asked for.
+    /// Points that were requested.
     pub fn len(&self) -> usize {
         self.asked.len()
     }
@@ -205,8 +205,13 @@ impl QueryResult {
         String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
     }
 
-    /// As JSON: `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null],
-    /// "pixels": [[u, v] or null], "visible": [bool]}]}`; the last two only of points with a camera.
+    /// As JSON:
+    ///
+    ///
+    ///
+    ///
+    /// `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or null], "visible": [bool]}]}`;
+    /// the last two only of points with a camera.
     pub fn to_json(&self) -> String {
         let times = self.followed.times.len();
         let points: Vec<serde_json::Value> = (0..self.asked.len())

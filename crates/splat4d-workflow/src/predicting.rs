@@ -30,16 +30,17 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-/// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are fitted to
-/// what is before the first of them: one start can fall where a wrong model is right by chance, say on a swing's turning point.
+/// Shares of the observed ticks at which trial forecasts for the choice of a model start, and their length. Models are
+/// fitted to what is before the first of them: at a single start a wrong model may be right by chance, for example on a
+/// swing's turning point.
 const STARTS: [f64; 3] = [0.6, 0.7, 0.8];
 const AHEAD: f64 = 0.2;
-/// Where the work goes, in the run.
+/// Output folder in the run.
 const FOLDER: &str = "predict";
 
-/// Nodes on dynamic regions unless others are asked for.
+/// Nodes on dynamic regions unless others are requested.
 pub const NODES: usize = 48;
-/// Steps of training unless others are asked for.
+/// Steps of training unless others are requested.
 pub const STEPS: usize = 1500;
 
 /// Options of [`predict`].
@@ -88,11 +89,11 @@ impl PredictOptions {
     }
 }
 
-/// Forecasts a scene and compares with the part of its capture that was kept from training. Returns the folder of the report,
-/// the forecasts and the predicted scene.
+/// Forecasts a scene and compares with the part of its capture that was kept from training. Returns the folder of the
+/// report, the forecasts and the predicted scene.
 ///
-/// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too short; nothing
-/// moves; another command writes the run; `stop` was raised, which is checked between models and images.
+/// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too
+/// short; nothing moves; another command writes the run; `stop` was raised, which is checked between models and images.
 ///
 /// ```no_run
 /// use splat4d_workflow::events::ignore;
@@ -142,8 +143,8 @@ struct Forecast {
 impl Work {
     /// Opens the run and finds its nodes.
     ///
-    /// Errors: a run that is unfinished or saw all of its take, too few observed frames, actions that are too short, nothing
-    /// that moves.
+    /// Errors: a run that is unfinished or saw all of its take, too few observed frames, actions that are too short,
+    /// nothing that moves.
     fn open(order: PredictOptions, console: &dyn Listener) -> Result<Self> {
         let run = Run::open(&order.run)?;
         let place = order.run.display().to_string();
@@ -181,7 +182,7 @@ impl Work {
     fn run(&self, stop: &AtomicBool, console: &dyn Listener) -> Result<()> {
         let folder = self.order.run.join(FOLDER);
         files::make_folder(&folder)?;
-        console.say(&format!(
+        console.result(&format!(
             "{} nodes on {} moving Gaussians, {} frames observed, {} to predict",
             self.observed.paths.nodes(),
             files::grouped(self.moving()),
@@ -189,7 +190,7 @@ impl Work {
             self.horizon
         ));
         let (views, oracle) = (Views::new(self)?, self.oracle()?);
-        // Freeze and constant velocity are what all others are compared with, asked for or not.
+        // All others are compared with freeze and constant velocity, requested or not.
         let mut models = vec![Model::Freeze, Model::Velocity];
         models.extend(self.order.models.iter().filter(|m| !models.contains(m)).copied().collect::<Vec<_>>());
         let mut forecasts: Vec<Forecast> = Vec::new();
@@ -254,7 +255,7 @@ impl Work {
         write::all(self, &folder, &told, &forecasts, best, console)?;
         let films = if self.order.film { views.films(self, &folder, best, stop, console)? } else { Vec::new() };
         let page = report::predict::write(&folder, &self.run.name(), &told, &films)?;
-        say(&told, console);
+        print_summary(&told, console);
         console.written(&page);
         Ok(())
     }
@@ -263,7 +264,7 @@ impl Work {
         self.observed.moving.iter().flatten().filter(|m| **m).count()
     }
 
-    /// Fits a model and lets it go on.
+    /// Fits a model and lets it continue.
     fn forecast(&self, model: Model) -> Result<Forecast> {
         let (paths, actions) = (&self.observed.paths, self.order.actions.as_ref());
         let started = Instant::now();
@@ -328,7 +329,7 @@ impl Work {
         (mean, Some(spread))
     }
 
-    /// The nodes in another scene's future, as far as that goes.
+    /// The nodes in another scene's future, as far as it is known.
     fn follow(&self, scene: &Scene<f32>) -> Vec<Moment> {
         let end = scene.clip[1] + 0.5 / self.clock.fps;
         let ticks: Vec<f64> = (0..=self.horizon).map(|h| self.clock.at(h)).take_while(|t| *t < end).collect();
@@ -352,21 +353,22 @@ impl Work {
         Ok(Some(scene))
     }
 
-    /// The model whose scene is written: the only one that was asked for, else the best at forecasting what was observed.
+    /// The model whose scene is written: the requested one if there is only one, else the best at forecasting what was
+    /// observed.
     fn chosen<'a>(&self, forecasts: &'a [Forecast]) -> &'a Forecast {
         let asked = |f: &&Forecast| self.order.models.contains(&f.model);
         let error = |f: &Forecast| f.backtest.unwrap_or(f64::INFINITY);
         let all = forecasts.iter().filter(asked);
-        all.min_by(|a, b| error(a).total_cmp(&error(b))).expect("one model was asked for at least")
+        all.min_by(|a, b| error(a).total_cmp(&error(b))).expect("at least one model was requested")
     }
 }
 
 /// The figures in the terminal.
-fn say(told: &Summary, console: &dyn Listener) {
+fn print_summary(told: &Summary, console: &dyn Listener) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| report::predict::rounded(x, digits));
-    console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
+    console.result("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {
-        console.say(&format!(
+        console.result(&format!(
             "{:<13}{:>6}{:>12} dB{:>18}{:>17}   fitted in {}",
             m.name,
             number(m.psnr, 2),

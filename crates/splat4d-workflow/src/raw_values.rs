@@ -19,14 +19,14 @@ pub enum RawFormat {
 
 /// First number of a .flo file, as text "PIEH" (Baker et al. 2011).
 const FLO_MAGIC: f32 = 202_021.25;
-/// What stands for a flow that is not known there: readers take anything above 1e9 for it.
+/// Marker of unknown flow: readers take anything above 1e9 for it.
 const FLO_UNKNOWN: f32 = 1e10;
 
 impl RawFormat {
     /// All of them.
     pub const ALL: [Self; 3] = [Self::Npy, Self::Flo, Self::Exr];
 
-    /// What it stores.
+    /// Its content.
     pub fn about(self) -> &'static str {
         match self {
             Self::Npy => "NumPy float32, [h,w,C], or [h,w] for one value",
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_come_back() {
+    fn raw_values_round_trip() {
         let npy = Npy::read(&RawFormat::Npy.bytes(Channel::Flow, &flow()).unwrap()).unwrap();
         assert_eq!((npy.shape.as_slice(), &npy.to_f32()[..4]), (&[2, 3, 2][..], &[1.0, 0.1, 2.0, 0.2][..]));
         let flo = RawFormat::Flo.bytes(Channel::Flow, &flow()).unwrap();

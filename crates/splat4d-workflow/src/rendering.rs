@@ -24,7 +24,7 @@ const PROBES: usize = 8;
 /// Range of a film in which nothing is to be seen, or of a channel that needs none.
 const NO_RANGE: [f32; 2] = [1.0, 2.0];
 
-/// What is composited behind a scene: red, green, blue.
+/// Background of a scene: red, green, blue.
 pub type Color = [f32; 3];
 
 /// Options of [`film`] and [`image()`].
@@ -162,7 +162,7 @@ fn stem(prefix: &Path) -> OsString {
     if ending { prefix.with_extension("").into_os_string() } else { prefix.as_os_str().to_owned() }
 }
 
-/// A painter of the channel that is asked for, on the device that is.
+/// A painter of the channel that is requested, on the device that is.
 fn channel<'a>(
     painter: Painter<'a>,
     args: &RenderOptions,
@@ -180,7 +180,8 @@ fn channel<'a>(
 
 /// Many images along a path.
 ///
-/// Errors: a scene, path or time range that does not fit; views of several sizes in a film; an output that cannot be written.
+/// Errors: a scene, path or time range that does not fit; views of several sizes in a film; an output that cannot be
+/// written.
 ///
 /// ```no_run
 /// use splat4d_workflow::draw::Channel;
@@ -290,7 +291,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     Ok(output)
 }
 
-/// Takes the folders of frames: of images, where the output is no single file, and of numbers.
+/// Takes the folders of frames: of images, where the output is not a single file, and of numbers.
 fn folders(args: &RenderOptions, output: &Path, count: usize, read: &sequence::Read<'_>) -> Result<Vec<OutputFolder>> {
     let pictures = output.extension().is_none().then(|| Pattern::plain(output, "png"));
     let numbers = args.raw.as_deref().map(|raw| Pattern::plain(raw, args.raw_format.ending()));

@@ -1,4 +1,4 @@
-//! What a run folder holds, read back: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
+//! Reads the files of a run folder: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
 //! `cameras.json`, `scene.safetensors` and checkpoints. Everything but the folder may be missing.
 
 use crate::files::{self, read_text};
@@ -10,7 +10,7 @@ use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
 use splat4d_train::event::Event;
-use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Request, STATE, Standing};
+use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, OwnerRecord, Request, STATE};
 use splat4d_train::path_text::{in_command, of_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
@@ -22,11 +22,12 @@ use std::path::{Path, PathBuf};
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// File of results that `compress` leaves next to the file that it writes, for the report and for machines.
 pub const COMPRESS: &str = "compress.json";
-/// File that holds the settings `compress` was asked for.
+/// File with the requested settings of `compress`.
 pub const ORDER: &str = "compress.toml";
 /// Start of the commands that train, in the record of who has a folder.
 const TRAIN: &str = "train";
-/// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is made again.
+/// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is
+/// made again.
 const KEPT: [&str; 9] = [
     "recipe.toml",
     "run.json",
@@ -48,7 +49,7 @@ pub struct Metrics {
     pub gaussians: f64,
     /// The stage of training.
     pub stage: String,
-    /// Seconds of training so far.
+    /// Seconds of training.
     pub seconds: f64,
     /// Milliseconds of each of [`Run::stages`].
     pub stages: Vec<f64>,
@@ -85,7 +86,7 @@ pub struct Run {
     pub views: Vec<ViewScore>,
     /// `compress.json`, where the run was made by compressing another.
     pub compressed: Value,
-    /// What was asked for, of a run without checkpoints.
+    /// The request of a run without checkpoints.
     asked: Option<RunRequest>,
     iteration: Option<usize>,
 }
@@ -110,7 +111,7 @@ impl Run {
         path.join("scene.safetensors").is_file()
     }
 
-    /// Reads the folder. Errors: it is no run; a file in it is damaged.
+    /// Reads the folder. Errors: it is not a run; a file in it is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         if !path.exists() {
             return Err(Error::input("no such run")
@@ -222,11 +223,11 @@ impl Run {
         recorded.or_else(|| self.asked.as_ref().map(|asked| asked.capture.clone()))
     }
 
-    /// What it was trained on.
+    /// Its capture.
     pub fn origin(&self) -> Origin {
         let opened = || {
             let (root, recipe) = (self.capture()?, self.recipe().ok()?);
-            // Also masks and maps that the recipe does not look at.
+            // Also masks and maps that the recipe does not use.
             Capture::open(&root, &capture_options(&recipe).ok()?).ok()
         };
         // A capture that can no longer be opened still has the images that the run was trained on.
@@ -310,11 +311,11 @@ impl Run {
 
 /// Whether training has taken a folder and written none of a run's files yet.
 fn is_starting(path: &Path) -> bool {
-    let trains = |who: Option<Standing>| who.is_some_and(|who| who.command.starts_with(TRAIN));
+    let trains = |who: Option<OwnerRecord>| who.is_some_and(|who| who.command.starts_with(TRAIN));
     path.join(STATE).is_dir() && (RunRequest::unbegun(path).is_some() || Owner::holder(path).is_some_and(trains))
 }
 
-/// Refuses a folder that a command has taken as its output and not written to yet. Errors: who has it.
+/// Refuses a folder that a command has taken as its output and not written to yet. Errors: another owner.
 pub fn check_written(folder: &Path) -> Result<()> {
     let mut there = std::fs::read_dir(folder).into_iter().flatten().flatten();
     if !folder.join(STATE).is_dir() || there.any(|entry| entry.file_name() != STATE) {
@@ -352,7 +353,7 @@ pub fn views_of(capture: &Capture) -> Vec<View> {
             held: capture.split(i) == Split::Held,
         }
     };
-    // A run may use a part of the capture only: `train` and `held` say which.
+    // A run may use a part of the capture only: `train` and `held` name it.
     let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
     used.sort_unstable();
     used.into_iter().map(view).collect()
@@ -409,7 +410,7 @@ fn read_view(value: &Value) -> Option<View> {
     })
 }
 
-/// Where a run of the capture with this name goes by default.
+/// Default folder of a run of the capture with this name.
 pub fn usual_folder(capture: &str) -> PathBuf {
     let name: String =
         capture.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
@@ -439,7 +440,7 @@ impl Origin {
     }
 }
 
-/// What a training run was asked for: the same command continues it, from whatever state a crash left.
+/// The request of a training run: the same command continues it, from whatever state a crash left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunRequest {
     version: String,
@@ -452,7 +453,7 @@ pub struct RunRequest {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
-    /// What the capture reads from elsewhere.
+    /// Files that the capture reads from elsewhere.
     #[serde(skip)]
     elsewhere: BTreeSet<PathBuf>,
 }
@@ -471,7 +472,7 @@ impl RunRequest {
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
     pub fn unbegun(run: &Path) -> Option<Self> {
-        let text = checkpoint::list(run).is_empty().then(|| OutputFolder::asked(run))??;
+        let text = checkpoint::list(run).is_empty().then(|| OutputFolder::unfinished_request(run))??;
         serde_json::from_str(&text).ok()
     }
 
@@ -479,7 +480,8 @@ impl RunRequest {
         Recipe::from_toml(&self.recipe)
     }
 
-    /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
+    /// Takes the folder of the run for a new training or the rest of one. The content of one that took no step is
+    /// removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, FolderContent)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
         let origin = Origin { capture: Some(self.capture.clone()), elsewhere: self.elsewhere.clone() };
@@ -502,8 +504,8 @@ pub fn on_event(folder: &OutputFolder, event: &Event) {
     }
 }
 
-/// Leaves the folder of a training that ended: one that failed before its first checkpoint after the start leaves nothing to
-/// continue.
+/// Leaves the folder of a training that ended: one that failed before its first checkpoint after the start leaves
+/// nothing to continue.
 pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<OutputFolder> {
     let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
     if trained.is_err() && !begun {
@@ -514,7 +516,7 @@ pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<
     Some(folder)
 }
 
-/// Where a new run goes: the wanted folder, or with a number behind it if that is taken.
+/// Folder of a new run: the requested one, or with a number appended if that is taken.
 pub fn free_folder(wanted: &Path) -> PathBuf {
     let holds = |p: &Path| std::fs::read_dir(p).is_ok_and(|d| d.flatten().any(|e| e.file_name() != STATE));
     let taken = |p: &Path| p.is_file() || holds(p) || Owner::holder(p).is_some();
@@ -533,7 +535,7 @@ pub fn free_folder(wanted: &Path) -> PathBuf {
 /// An entry `ours_N` of `results.json` next to the one that the run is judged by.
 #[derive(Clone, Debug)]
 pub struct Baseline<'a> {
-    /// What it is called: a split, and a background where it is not the run's own.
+    /// Its name: a split, and a background where it is not the run's own.
     pub name: &'a str,
     pub step: usize,
     pub scores: &'a Value,

@@ -1,4 +1,4 @@
-//! Numbered files, one a frame: finding them, naming them, and the times they stand for.
+//! Numbered files, one per frame: finding them, naming them, and the times they represent.
 
 use crate::files::{cannot_read, either};
 use crate::run_folder::Run;
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 const MAX_FILES: f64 = 100_000.0;
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
-/// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after 7,000
-/// and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
+/// Programs save their Gaussians every n steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after
+/// 7,000 and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
 const SNAPSHOTS: u64 = 500;
 /// Gaps of a sequence that are named.
 const NAMED_GAPS: usize = 8;
@@ -99,7 +99,8 @@ impl Pattern {
     }
 }
 
-/// Bytes `from..to` of a name, where these are characters of ours or the name's ends. `None`: the system has no such part.
+/// Bytes `from..to` of a name, where these are characters of ours or the name's ends. `None`: the system has no such
+/// part.
 fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     #[cfg(unix)]
     {
@@ -110,7 +111,7 @@ fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     Some(name.to_str()?.get(from..to)?.into())
 }
 
-/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may be in their run.
+/// Inputs of a command that writes frames: none of it may be the folder of the frames. Renders may be in their run.
 pub struct Read<'a> {
     /// The scene.
     pub path: &'a Path,
@@ -120,7 +121,8 @@ pub struct Read<'a> {
 
 /// Takes a folder for the first `count` frames of these patterns.
 ///
-/// Errors: another process has it; it is what is read; it holds frames of another sequence, or such as splat4d has no record of.
+/// Errors: another process owns it; it is an input; it holds frames of another sequence, or such as splat4d has no
+/// record of.
 pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str, force: bool) -> Result<OutputFolder> {
     let origin = read.run.map(Run::origin).unwrap_or_default();
     let mut inputs: Vec<Input<'_>> = origin.inputs().collect();
@@ -142,20 +144,20 @@ pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str,
     OutputFolder::begin(patterns[0].folder(), &request).map(|(folder, _)| folder)
 }
 
-/// The frames that a folder or a pattern stands for, by their numbers.
+/// The frames that a folder or a pattern represents, by their numbers.
 #[derive(Debug)]
 pub struct Frames {
     /// In the order of their numbers.
     pub files: Vec<PathBuf>,
     /// Frames from the first to each, by the numbers.
     pub numbers: Vec<u64>,
-    /// Numbers that are missing between them, as people say it.
+    /// Numbers that are missing between them, as text.
     pub missing: Option<String>,
-    /// The newest file, where the numbers look like steps of a training.
+    /// The newest file, if the numbers are probably training steps.
     pub snapshots: Option<PathBuf>,
 }
 
-/// The frames that a folder or a pattern stands for, in the order of their numbers.
+/// The frames that a folder or a pattern represents, in the order of their numbers.
 ///
 /// Errors: none are there, two have one number, or a folder holds several kinds.
 pub fn frames(path: &Path) -> Result<Frames> {
@@ -192,7 +194,7 @@ pub fn frames(path: &Path) -> Result<Frames> {
     }
     let first = found[0].0;
     let last = found[found.len() - 1].0;
-    // Numbers with so many of them missing are no frames of one sequence.
+    // Numbers with this many of them missing are no frames of one sequence.
     let steps = || found.windows(2).map(|w| w[1].0 - w[0].0);
     // Every tenth frame is a sequence without gaps.
     let step = steps().fold(0, gcd).max(1);
@@ -256,7 +258,7 @@ pub fn newest(folder: &Path) -> Option<(PathBuf, Option<u64>)> {
         .or_else(|| alone.is_file().then_some((alone, None)))
 }
 
-/// The scene file that stands for a folder in a sequence of folders: a result of 3DGS, or the only scene file in it.
+/// The scene file that represents a folder in a sequence of folders: a result of 3DGS, or the only scene file in it.
 fn only_scene(folder: &Path, endings: &[&str]) -> Option<PathBuf> {
     if let Some((file, _)) = newest(folder) {
         return Some(file);
@@ -276,7 +278,7 @@ pub fn endings() -> Vec<&'static str> {
 
 /// The last number in the name of a file that may be a frame.
 fn number_in(name: &OsStr) -> Option<u64> {
-    // Digits and the ending are ASCII: what else there is does not matter.
+    // Digits and the ending are ASCII: the rest does not matter.
     let name = name.to_string_lossy();
     let (stem, ending) = name.split_at(name.rfind('.')?);
     if name.starts_with('.') || !endings().iter().any(|e| ending.eq_ignore_ascii_case(e)) {
@@ -326,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_in_the_order_of_their_numbers() {
+    fn frames_are_ordered_by_number() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["f10.ply", "f9.ply", "f100.compressed.ply", "notes.txt", "cover.ply", ".9.ply"] {
             std::fs::write(folder.path().join(name), b"").unwrap();

@@ -21,7 +21,7 @@ use std::path::Path;
 const OUTLIERS: f64 = 0.1;
 /// Share of a cloud's means beyond each side of the box that a first view shows: thin parts stay in it, strays do not.
 const BEYOND: f64 = 0.01;
-/// Room around that box.
+/// Margin around that box.
 const ROOM: f64 = 1.1;
 
 /// Remedy that lists the files that can be opened, for errors.
@@ -30,7 +30,7 @@ fn remedy() -> String {
     format!("Give a run folder, a scene.safetensors, a checkpoint, a .s4d, or a {others} file.")
 }
 
-/// A scene and where it came from.
+/// A scene and its origin.
 pub struct Source {
     pub scene: Scene<f32>,
     /// The run, where it is one.
@@ -39,16 +39,16 @@ pub struct Source {
     pub ply: Option<PlyInfo>,
     /// The start of the playback file, where it is one.
     pub playback: Option<Index>,
-    /// Where the playback file comes from, where it states so; written along into playback files that are made of it.
+    /// Provenance of the playback file, if stated; copied into playback files made of it.
     pub provenance: Option<Provenance>,
-    /// Whose format it is, where it is not our own.
+    /// Name of a foreign format.
     pub dialect: Option<Dialect>,
     /// Warnings about parts that could not be read, or had to be assumed.
     pub warnings: Warnings,
 }
 
-/// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
-/// needs, and one in a folder that another process owns.
+/// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or
+/// what any run needs, and one in a folder that another process owns.
 pub fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
     // A new file replaces nothing: the capture need not be opened.
     let origin = run.filter(|_| output.is_file()).map(Run::origin).unwrap_or_default();
@@ -113,14 +113,14 @@ impl Source {
                 warnings: o.warnings,
                 ..Self::own(o.scene)
             }),
-            None if looks_own(&bytes) => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
+            None if is_own_format(&bytes) => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
             None => Err(foreign::unread(&name, &bytes).unwrap_or_else(|| {
                 Error::input("unknown format: its first bytes match none that splat4d reads").remedy(remedy())
             })),
         };
         let mut source = opened.map_err(|e| e.at(path.display()))?;
         if let Some(network) = bundle::network_of(path).filter(|_| source.ply.is_some()) {
-            source.warnings.say(format!(
+            source.warnings.add(format!(
                 "{} belongs to these Gaussians: a network that splat4d does not read moves or generates them, so this is not \
                  the scene as trained. Export it as a sequence of .ply files",
                 network.display()
@@ -129,12 +129,12 @@ impl Source {
         Ok(source)
     }
 
-    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them. Says
-    /// what else of a .ply is lost: times and velocities of a moving scene, for instance.
+    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer accepts
+    /// them. Reports what else of a .ply is lost: times and velocities of a moving scene, for instance.
     pub fn finite(mut self) -> Self {
         let unread = self.ply.as_ref().map_or(&[][..], |ply| &ply.extra_properties);
         if !unread.is_empty() {
-            self.warnings.say(format!("properties of the .ply that are not read: {}", unread.join(", ")));
+            self.warnings.add(format!("properties of the .ply that are not read: {}", unread.join(", ")));
         }
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
@@ -178,11 +178,11 @@ impl Source {
 }
 
 /// Whether a file may be safetensors: eight bytes of length, then JSON.
-fn looks_own(bytes: &[u8]) -> bool {
+fn is_own_format(bytes: &[u8]) -> bool {
     bytes.get(8) == Some(&b'{')
 }
 
-/// By content; by its ending only where there is nothing in the content to know it by.
+/// By content; by its ending only if the content does not identify it.
 fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
     let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
     Dialect::of_file(&name, bytes)
@@ -196,13 +196,13 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     // Frames far from the origin may each have an offset: that of the first is the scene's.
     let mut offset = None;
     if let Some(newest) = &found.snapshots {
-        warnings.say(format!(
+        warnings.add(format!(
             "the numbers of these files are steps of a training rather than frames: if so, give the newest, {}",
             newest.display()
         ));
     }
     if let Some(missing) = &found.missing {
-        warnings.say(format!("frames are missing: {missing}. The scene is empty at their times"));
+        warnings.add(format!("frames are missing: {missing}. The scene is empty at their times"));
     }
     for file in &found.files {
         let bytes = files::read(file)?;
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_another_programs_ply_are_not_lost_without_a_word() {
+    fn unread_times_of_other_programs_plys_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("4d.ply");
         let names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 t scale_t";

@@ -16,11 +16,11 @@ use std::path::Path;
 #[serde(rename_all = "snake_case")]
 pub enum State {
     Done,
-    /// A worker has it.
+    /// A worker is training it.
     Training,
     /// It begins where other parts end that are not done.
     Waiting,
-    /// It was begun, and no worker has it.
+    /// It was begun, and no worker is training it.
     Stopped,
     /// It can be begun.
     Open,
@@ -29,19 +29,19 @@ pub enum State {
 /// A part of a run: a chunk, the static background, or all of it.
 #[derive(Clone, Debug, Serialize)]
 pub struct PartStatus {
-    /// What `train --chunk` calls it; `all`: the run is not in chunks.
+    /// Its name for `train --chunk`; `all`: the run is not in chunks.
     part: String,
     /// First frame and the one after the last.
     frames: Option<[usize; 2]>,
     state: State,
-    /// Who has it: command, process, host, since when.
+    /// Its owner: command, process, host, start.
     worker: Option<String>,
     /// Parts that it waits for.
     waits_for: Vec<String>,
     iteration: Option<usize>,
     iterations: Option<usize>,
     gaussians: Option<usize>,
-    /// Of training so far.
+    /// Of training.
     seconds: Option<f64>,
     seconds_left: Option<f64>,
     /// Bytes.
@@ -64,11 +64,11 @@ pub struct Status {
     parts: Vec<PartStatus>,
     /// Parts that were begun and that no worker has.
     failures: Vec<String>,
-    /// What to type next.
+    /// The next command.
     next: Option<String>,
 }
 
-/// Reads how far a run is. Errors: it is no run, or damaged.
+/// Reads how far a run is. Errors: it is not a run, or damaged.
 pub fn of(path: &Path) -> Result<Status> {
     let run = Run::open(path)?;
     let mut parts = if Chunked::is(path) { of_chunks(&Chunked::open(path)?) } else { vec![whole(path, &run)] };
@@ -179,7 +179,11 @@ impl PartStatus {
     }
 
     fn failure(&self) -> String {
-        format!("{} stopped at step {}, and no worker has it", self.name(), grouped(self.iteration.unwrap_or(0)))
+        format!(
+            "{} stopped at step {}, and no worker is training it",
+            self.name(),
+            grouped(self.iteration.unwrap_or(0))
+        )
     }
 
     fn text(&self) -> String {
@@ -189,7 +193,7 @@ impl PartStatus {
             State::Done => "done".to_owned(),
             State::Training => format!("{step}, {}", self.worker.as_deref().unwrap_or_default()),
             State::Waiting => format!("waits for {}", self.waits_for.join(", ")),
-            State::Stopped => format!("stopped at {step}: no worker has it"),
+            State::Stopped => format!("stopped at {step}: no worker is training it"),
             State::Open => "not begun".to_owned(),
         };
         if let Some([from, to]) = self.frames {

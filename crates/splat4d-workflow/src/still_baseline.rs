@@ -33,7 +33,7 @@ pub fn baseline(
     let cached = Run::is_finished(&folder)
         && Run::open(&folder).and_then(|b| b.recipe()).is_ok_and(|b| b.resolve() == recipe.resolve());
     if !cached {
-        console.say("training a still scene with the same recipe, to compare");
+        console.result("training a static scene with the same recipe, to compare");
         out.clear_inner(BASELINE)?;
         let (capture, _) = run.open_capture()?;
         files::make_folder(&folder)?;
@@ -44,10 +44,10 @@ pub fn baseline(
             run::train(Arc::new(capture), recipe, &folder, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         if outcome.interrupted {
-            return Err(Error::new(ErrorKind::Interrupted, "the still scene is unfinished")
+            return Err(Error::new(ErrorKind::Interrupted, "the static scene is unfinished")
                 .remedy("Run `splat4d eval --baseline` again; it trains again."));
         }
-        console.stop_not_polled("the still scene is kept, and the same command makes what is missing");
+        console.stop_not_polled("the static scene is kept, and the same command makes the rest");
     }
     let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
     let evaluation = evaluating::scores(&folder, &scene, measure, stop, console)?;

@@ -19,7 +19,7 @@ pub fn path(text: &str) -> Result<()> {
     paths::check_keys(text)
 }
 
-/// Reads points that are asked for, as `--points` does; of a scene of one second with one camera, `cam1`.
+/// Reads points that are requested, as `--points` does; of a scene of one second with one camera, `cam1`.
 pub fn points(text: &str) -> Result<()> {
     let camera = Camera::with_fov_y(splat4d::math::Se3::IDENTITY, 0.8, 8, 6);
     let view = paths::View { camera, name: "cam1".into(), time: 0.0, held: false };
@@ -31,7 +31,7 @@ pub fn compress_order(text: &str) -> Result<()> {
     CompressJob::read(text).map(drop)
 }
 
-/// Who answers the page of `view --edit`.
+/// The server side of `view --edit`.
 pub struct Page(Editor);
 
 impl Page {
@@ -40,7 +40,7 @@ impl Page {
         Editor::new(Source::own(scene), "fuzz".into(), list).map(Self)
     }
 
-    /// Does what a page asks for.
+    /// Does what a page requests.
     pub fn ask(&self, text: &str) -> Result<()> {
         let asked = serde_json::from_str(text).map_err(|e| Error::input(format!("invalid JSON: {e}")))?;
         self.0.answer(asked).map(drop)

@@ -1,5 +1,5 @@
-//! The work behind `train`: a capture becomes a run: trained, baked, measured, filmed and reported. Long captures are trained in
-//! chunks, and runs are continued.
+//! The work behind `train`: a capture becomes a run: trained, baked, measured, filmed and reported. Long captures are
+//! trained in chunks, and runs are continued.
 
 use crate::chunked::{self, ChunkSelection};
 use crate::deadline::Deadline;
@@ -25,21 +25,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Time between two looks whether the worker that begins a long capture has begun it.
+/// Time between two checks whether the worker that begins a long capture has begun it.
 const WAIT: Duration = Duration::from_millis(200);
-/// What an owner's record calls this work.
+/// Name of this work in an owner's record.
 const TRAIN: &str = "train";
 /// The same of joining chunks.
 const JOIN: &str = "join";
-/// What is reported when training is stopped.
+/// Message when training is stopped.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 
-/// What follows training.
+/// Work after training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Finish {
     /// Nothing: the run has its scene.
     Scene,
-    /// Labels and features, where the capture has them, and the playback file.
+    /// Labels and features, if the capture has them, and the playback file.
     Playback,
     /// These, and scores of held-out views, an orbit film and the report.
     #[default]
@@ -53,7 +53,7 @@ pub struct TrainingOptions {
     pub output: Option<PathBuf>,
     /// Replace the run in the output folder once the new run has begun.
     pub force: bool,
-    /// Finish within so many minutes of the clock, whatever follows training included.
+    /// Finish within this many minutes of the clock, whatever follows training included.
     pub minutes: Option<f64>,
     /// Report the expected time first.
     pub predict: bool,
@@ -63,13 +63,14 @@ pub struct TrainingOptions {
     pub device: Device,
     /// How held-out views are measured.
     pub measure: Measure,
-    /// What follows training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states chunks.
+    /// Work after training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states
+    /// chunks.
     pub finish: Finish,
     /// The clock of `minutes`; its zero is when these options were made.
     pub clock: Stopwatch,
     /// A loss of the caller in addition to the recipe's.
     pub own_loss: Option<OwnLoss>,
-    /// What the folder's lock names as its owner, for other programs.
+    /// The owner named by the folder's lock, for other programs.
     pub command: &'static str,
 }
 
@@ -102,11 +103,11 @@ pub struct Trained {
     pub interrupted: bool,
 }
 
-/// Trains a scene of a capture by a recipe, and does what follows training. Frames of captures that are shipped as videos are
-/// extracted first. The same request continues a run that it began.
+/// Trains a scene of a capture by a recipe, and does what follows training. Frames of captures that are shipped as
+/// videos are extracted first. The same request continues a run that it began.
 ///
-/// Errors: the capture cannot be read; the output folder contains something else, or belongs to another process; training
-/// diverged.
+/// Errors: the capture cannot be read; the output folder contains something else, or belongs to another process;
+/// training diverged.
 ///
 /// ```no_run
 /// use splat4d_train::recipe::Recipe;
@@ -136,8 +137,8 @@ pub fn train(
     work.begin(&Begin { capture, recipe, minutes, predict, output, resumed: false })
 }
 
-/// Continues a run from its newest checkpoint, and does what follows training. Of the options only `device`, `measure`, `finish`,
-/// `clock`, `own_loss` and `chunk` count.
+/// Continues a run from its newest checkpoint, and does what follows training. Of the options only `device`, `measure`,
+/// `finish`, `clock`, `own_loss` and `chunk` count.
 ///
 /// Errors: no such run; it belongs to another process; those of training.
 pub fn resume(run: &Path, options: &TrainingOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<Trained> {
@@ -194,7 +195,7 @@ impl<'a> Work<'a> {
         self.listener.on_event(&crate::events::Event::Begun { title, run, capture });
     }
 
-    /// Options of the trainer. `finish`: what follows training takes as long as about so many steps.
+    /// Options of the trainer. `finish`: what follows training takes as long as about this many steps.
     fn options(&self, minutes: Option<f64>, finish: f64, predict: bool) -> TrainOptions {
         TrainOptions {
             device: chosen(self.options.device, "training", self.listener),
@@ -207,7 +208,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// What follows training, in training steps.
+    /// Work after training, in training steps.
     fn finish_steps(&self, capture: &Capture, recipe: &Recipe) -> f64 {
         match self.options.finish {
             Finish::Scene => 0.0,
@@ -259,7 +260,7 @@ impl<'a> Work<'a> {
             };
             let run = folder.as_ref().unwrap_or_else(|shared| shared).path().to_owned();
             describe(&capture, estimate.memory, listener);
-            listener.say(&chunked::in_words(&estimate));
+            listener.result(&chunked::in_words(&estimate));
             self.begun(&capture.name, &run, Some(&capture));
             let begun = Chunked::begin(&capture, &estimate.recipe, &run, &mut |event| listener.event(event))?;
             let chunked = begun.expect("a capture that has a plan is trained by it").paced(estimate.pacing);
@@ -292,7 +293,8 @@ impl<'a> Work<'a> {
         };
         listener.stop_polled(SAVING);
         let trained = if found == FolderContent::Unfinished {
-            listener.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
+            listener
+                .result(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
             run::resume_with(&run, &training, self.stop, &mut on_event)
         } else {
             // The recipe first: whatever happens from here on, the folder is recognised as a run.
@@ -325,8 +327,8 @@ impl<'a> Work<'a> {
             in_command(run)
         );
         listener.stop_not_polled(&kept);
-        listener.say(&format!("wrote {}", run.join("scene.safetensors").display()));
-        evaluating::say_refined(run, listener)?;
+        listener.result(&format!("wrote {}", run.join("scene.safetensors").display()));
+        evaluating::print_refined(run, listener)?;
         self.follow(run, resumed).map_err(|e| match e.kind() {
             ErrorKind::Interrupted => Error::new(ErrorKind::Interrupted, format!("stopped: {kept}")),
             _ => e,
@@ -399,7 +401,7 @@ impl<'a> Work<'a> {
                 String::new()
             };
             let text = format!("{} exists{hint}: this run is written to {}", wanted.display(), run.display());
-            self.listener.say(&text);
+            self.listener.result(&text);
         }
         asked.begin(&run, options.force, options.command)
     }
@@ -416,7 +418,7 @@ fn extract(source: &Path, stop: &AtomicBool, listener: &dyn Listener) -> Result<
     listener.clear();
     let Some(found) = found else { return Ok(()) };
     found.warnings.iter().for_each(|w| listener.warn(w));
-    listener.say(&format!(
+    listener.result(&format!(
         "frames of {} videos are in {}: {} of {}x{}",
         found.cameras,
         root.join("images").display(),
@@ -451,7 +453,7 @@ fn describe(capture: &Capture, memory: u64, listener: &dyn Listener) {
         Timing::Moment => "at one time".to_owned(),
         _ => format!("over {:.2} s", last - first),
     };
-    listener.say(&format!(
+    listener.result(&format!(
         "{}: {} camera{}, {} images of {}x{} {span}{}",
         capture.name,
         capture.cameras.len(),

@@ -34,7 +34,7 @@ pub enum Film {
         output: Staged,
         /// The program.
         child: Child,
-        /// Where frames go.
+        /// Destination of frames.
         pipe: Option<ChildStdin>,
         /// Collects what ffmpeg states.
         words: Option<std::thread::JoinHandle<Vec<u8>>>,
@@ -50,7 +50,7 @@ pub enum Film {
     Folder {
         /// The folder.
         path: PathBuf,
-        /// Frames so far.
+        /// Number of frames.
         next: usize,
     },
 }
@@ -125,7 +125,7 @@ impl Film {
             Self::Mp4 { pipe, .. } => {
                 let written = pipe.as_mut().map(|p| p.write_all(&picture.data));
                 if !matches!(written, Some(Ok(()))) {
-                    return Err(self.what_ffmpeg_said());
+                    return Err(self.ffmpeg_messages());
                 }
             }
             Self::Apng { writer, output } => {
@@ -144,7 +144,7 @@ impl Film {
         if let Self::Mp4 { child, pipe, .. } = &mut self {
             drop(pipe.take());
             if !child.wait().is_ok_and(|s| s.success()) {
-                return Err(self.what_ffmpeg_said());
+                return Err(self.ffmpeg_messages());
             }
         }
         match self {
@@ -158,7 +158,7 @@ impl Film {
         Ok(())
     }
 
-    fn what_ffmpeg_said(&mut self) -> Error {
+    fn ffmpeg_messages(&mut self) -> Error {
         let Self::Mp4 { child, pipe, words, .. } = self else {
             unreachable!("only ffmpeg's films have words of ffmpeg");
         };

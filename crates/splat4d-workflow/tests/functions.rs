@@ -124,7 +124,7 @@ fn a_capture_is_trained_and_continued_by_functions() {
 }
 
 #[test]
-fn what_cannot_be_written_is_an_error() {
+fn unwritable_outputs_are_errors() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let scene = at("scene.ply");
@@ -172,7 +172,7 @@ fn a_scene_is_edited_and_filmed_and_scores_are_compared() {
 }
 
 #[test]
-fn workflows_of_runs_refuse_what_is_no_run() {
+fn workflows_of_runs_refuse_other_folders() {
     let folder = tempfile::tempdir().unwrap();
     let (run, stop) = (folder.path(), AtomicBool::new(false));
     let errors = [

@@ -1,6 +1,6 @@
-//! The renderer's stages, one by one and together, on 30,000 synthetic Gaussians with spherical harmonics of degree
-//! 3 at
-//! 400x400, on one and two threads: `cargo bench -p splat4d`. `studies bench` measures real scenes against the roofline.
+//! The renderer's stages, one by one and together, on 30,000 synthetic Gaussians with spherical harmonics of degree 3
+//! at 400x400, on one and two threads: `cargo bench -p splat4d`. `studies bench` measures real scenes against the
+//! roofline.
 
 use divan::{Bencher, black_box};
 use splat4d::math::{Rng, Se3, sh, sym3};
@@ -68,7 +68,7 @@ impl Made {
     }
 }
 
-/// What the stages hand on.
+/// Data between the stages.
 struct Stages {
     config: RenderConfig,
     projected: Vec<Projected>,

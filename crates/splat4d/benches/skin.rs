@@ -12,7 +12,7 @@ const GAUSSIANS: usize = 100_000;
 const THREADS: [usize; 2] = [1, 2];
 /// Timed calls of each.
 const SAMPLES: u32 = 20;
-/// The time that is asked for, seconds.
+/// The time that is requested, seconds.
 const T: Time = Time(0.37);
 
 fn main() {
@@ -77,8 +77,8 @@ fn forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
     });
 }
 
-/// What skinning must read and write once as copies: 11 numbers, 2 hyper coordinates and 8 candidates of every Gaussian in,
-/// 10 out, twice for the backward.
+/// Minimum memory traffic of skinning: 11 numbers, 2 hyper coordinates and 8 candidates of every Gaussian in, 10 out,
+/// twice for the backward.
 #[divan::bench(sample_count = SAMPLES)]
 fn ceiling_bytes(bencher: Bencher<'_, '_>) {
     const BYTES: usize = GAUSSIANS * (11 + 2 + 8 + 10) * 4 * 2;

@@ -1,8 +1,8 @@
 //! Drags the control nodes of a trained scene, as rigidly as possible, and renders it before and after into PPM images.
 //!
-//! `cargo run --release -p splat4d --example drag SCENE.safetensors BEFORE.ppm AFTER.ppm [SECONDS]`. The lower half of the
-//! nodes is pinned, the topmost tenth moves sideways. Without arguments it drags a synthetic rod. The scene keeps its trained
-//! motion; only its nodes are displaced.
+//! `cargo run --release -p splat4d --example drag SCENE.safetensors BEFORE.ppm AFTER.ppm [SECONDS]`. The lower half of
+//! the nodes is pinned, the topmost tenth moves sideways. Without arguments it drags a synthetic rod. The scene keeps
+//! its trained motion; only its nodes are displaced.
 
 use splat4d::format;
 use splat4d::layers::{Evaluation, Layer, Scene};
@@ -19,7 +19,7 @@ use std::sync::Arc;
 /// Rounds of turning and moving: after these no eye sees a difference.
 const ROUNDS: usize = 8;
 
-/// A rod of grey Gaussians that stands upright, on control nodes.
+/// A rod of grey Gaussians that is upright, on control nodes.
 fn sample() -> splat4d::Result<Scene<f32>> {
     let mut params = Params::new(4000, 1, LifeKind::Infinite.columns());
     for i in 0..4000 {
@@ -59,7 +59,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("the scene has no control nodes: train it with --motion control".into());
     };
 
-    // Nodes as they are at this moment.
+    // Nodes at this time.
     let poses = motion.poses(&layer.params, t);
     let nodes = &layer.params[motion.skin.nodes];
     let now: Vec<[f64; 3]> =

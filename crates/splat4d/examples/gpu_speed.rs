@@ -52,7 +52,7 @@ fn main() -> splat4d::Result<()> {
     let mut image = Image::default();
     for tables in [Tables::Constant, Tables::Changing] {
         renderer.tables = tables;
-        // The first one makes room.
+        // The first one is a warm-up.
         renderer.render(&shot, &mut image)?;
         let mut all: Vec<_> = Vec::new();
         for _ in 0..frames {

@@ -111,7 +111,7 @@ fn check_gradient() -> splat4d::Result<()> {
     let model = Sway::new(1.7, &mut p)?;
     p[GEOMETRY].write(0, QUAT, [0.9, 0.1, -0.3, 0.2]);
     p[model.amplitudes].write(0, 0, [0.3, -0.2, 0.1]);
-    let question = |p: &Params<f64>, t: f64| {
+    let query = |p: &Params<f64>, t: f64| {
         let mut tape = Tape::default();
         let rows = splat4d::scene::Rows::All;
         model.at(&At { p, of: Space::Gaussians, rows, t: Time(t) }, &Cache::default(), &mut tape);
@@ -125,10 +125,10 @@ fn check_gradient() -> splat4d::Result<()> {
     let d_out = SplatGrads { out: &ones, color: None, weights: None };
     let (mut cache, mut tape) = (Cache::default(), Tape::default());
     let d_time = model.backward(&q, &Cache::default(), &mut tape, &d_out, &mut cache, &mut grads);
-    let by_time = (question(&p, t + h) - question(&p, t - h)) / (2.0 * h);
+    let by_time = (query(&p, t + h) - query(&p, t - h)) / (2.0 * h);
     let mut moved = p.clone();
     *moved[model.amplitudes].get_mut(0, 0) += h;
-    let by_amplitude = (question(&moved, t) - question(&p, t)) / h;
+    let by_amplitude = (query(&moved, t) - query(&p, t)) / h;
     let d_amplitude = grads.table(model.amplitudes).get(0, 0);
     println!(
         "dL/dt {d_time:.6}, by differences {by_time:.6}; dL/da {d_amplitude:.6}, by differences {by_amplitude:.6}"

@@ -1,8 +1,8 @@
 //! Packs a scene into a playback file, and prints its size and loss.
 //!
-//! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors whose
-//! layers move linearly, or a 3DGS .ply. Without one it packs 120,000 synthetic moving Gaussians with spherical harmonics of
-//! degree 3. Nothing is pruned: the figures are those of the format alone.
+//! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors
+//! whose layers move linearly, or a 3DGS .ply. Without one it packs 120,000 synthetic moving Gaussians with spherical
+//! harmonics of degree 3. Nothing is pruned: the figures are those of the format alone.
 
 use serde_json::Value;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive, Viewpoint, WriteConfig};
@@ -74,7 +74,7 @@ fn load(bytes: &[u8]) -> splat4d::Result<Scene<f32>> {
     Ok(Scene { layers: vec![layer], up: [0.0, -1.0, 0.0], ..Scene::default() })
 }
 
-/// Learnt numbers a Gaussian.
+/// Learnt numbers per Gaussian.
 fn floats(layer: &Layer<f32>) -> usize {
     layer.params.keys().map(|k| layer.params[k].width()).sum()
 }
@@ -128,7 +128,7 @@ fn made_up() -> Scene<f32> {
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, -1.0, 0.0], ..Scene::default() }
 }
 
-/// All Gaussians as primitives, each in the deepest node of a binary tree that holds its life.
+/// All Gaussians as primitives, each in the deepest node of a binary tree that holds its lifespan.
 fn draft(scene: &Scene<f32>) -> Result<Draft, String> {
     let end = scene.clip[1] + 1.0 / scene.fps;
     let mut nodes = vec![Node { from: scene.clip[0], to: end, primitives: Vec::new() }];

@@ -1,7 +1,7 @@
 //! Renders a 3DGS .ply or a scene.safetensors at one time into a PPM image.
 //!
-//! `cargo run --release -p splat4d --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it renders a small scene
-//! from memory.
+//! `cargo run --release -p splat4d --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it renders a small
+//! scene from memory.
 
 use splat4d::format;
 use splat4d::layers::{Evaluation, Layer, Scene};
@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scene = load(&bytes)?;
     let t = Time(args.get(2).map_or(Ok(scene.clip[0]), |s| s.parse())?);
 
-    // The motion models answer for this time; the renderer sees only splats.
+    // The motion models are evaluated at this time; the renderer gets only splats.
     let mut instant = Evaluation::default();
     scene.at(t, &mut instant);
     let splats = scene.splats(&instant);

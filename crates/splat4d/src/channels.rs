@@ -1,7 +1,7 @@
-//! What images show next to colour, alpha and depth: normals, labels, features, lives and uncertainty, each as
-//! further channels of the
-//! renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a splat has a value, so that
-//! [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and flow are in [`flow`](crate::flow).
+//! Image channels next to colour, alpha and depth: normals, labels, features, lifespans and uncertainty, each as
+//! further channels of the renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a
+//! splat has a value, so that [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and
+//! flow are in [`flow`](crate::flow).
 
 use crate::layers::{Evaluation, Scene};
 use crate::math::{Real, sym3};
@@ -14,8 +14,8 @@ const LEAST_GAP: f64 = 1e-3;
 /// Standard deviation of a pixel's error that [`uncertainties`] takes for granted: images of 26 dB.
 pub(crate) const PIXEL_NOISE: f64 = 0.05;
 
-/// Unit normals, the shortest axes of the splats turned towards the camera, in camera axes (x right, y down, z forward):
-/// [splats, 4], x, y, z and 1; zeros where no axis is the shortest.
+/// Unit normals, the shortest axes of the splats turned towards the camera, in camera axes (x right, y down, z
+/// forward): [splats, 4], x, y, z and 1; zeros where no axis is the shortest.
 pub fn normal_columns<F: Real>(instant: &Evaluation<F>, camera: &Camera) -> Table<F> {
     let rows = instant.tapes().map(|t| t.out().rows()).sum();
     let mut out = Table::new(&[("normal", 3), ("valid", 1)], rows);
@@ -38,8 +38,8 @@ pub fn normal_columns<F: Real>(instant: &Evaluation<F>, camera: &Camera) -> Tabl
     out
 }
 
-/// Probabilities of the scene's labels: [splats, labels + 1], the last 1, or zeros in layers without labels. `None`: the
-/// scene has no labels.
+/// Probabilities of the scene's labels: [splats, labels + 1], the last 1, or zeros in layers without labels. `None`:
+/// the scene has no labels.
 ///
 /// Panics: `instant` is not this scene's.
 pub fn label_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Option<Table<F>> {
@@ -64,8 +64,8 @@ pub fn label_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Opti
     Some(out)
 }
 
-/// The scene's feature channels: [splats, channels + 1], the last 1, or zeros in layers without features. `None`: the scene
-/// has none.
+/// The scene's feature channels: [splats, channels + 1], the last 1, or zeros in layers without features. `None`: the
+/// scene has none.
 ///
 /// Panics: `instant` is not this scene's.
 pub fn feature_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Option<Table<F>> {
@@ -90,9 +90,9 @@ pub fn feature_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Op
     Some(out)
 }
 
-/// A number a Gaussian, by layer and row, as [splats, 2]: it and 1; zeros where it is not finite.
+/// A number per Gaussian, by layer and row, as [splats, 2]: it and 1; zeros where it is not finite.
 ///
-/// Panics: `instant` is not of a scene with so many layers and rows.
+/// Panics: `instant` is not of a scene with this many layers and rows.
 pub fn number_columns<F: Real>(instant: &Evaluation<F>, numbers: &[Vec<f32>]) -> Table<F> {
     let rows = instant.tapes().map(|t| t.out().rows()).sum();
     let mut out = Table::new(&[("number", 1), ("valid", 1)], rows);
@@ -126,12 +126,11 @@ pub struct Witness<'a> {
     pub t: Time,
 }
 
-/// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row:
-/// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
-/// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may be
-/// from where it is when no image shows it. Each witness stands for `share` images. Other Gaussians are taken for
-/// known,
-/// so that it states too little where several could explain a pixel.
+/// The standard deviation of each Gaussian's position that its images leave open, scene units, by layer and row: √(tr
+/// (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
+/// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may
+/// be from where it is when no image shows it. Each witness represents `share` images. Other Gaussians are taken for
+/// known, so that it states too little where several could explain a pixel.
 ///
 /// Source: the Fisher blocks of PUP 3D-GS (Hanson et al. 2025), read as the precision of a Laplace approximation with a
 /// Gaussian prior as in Bayes' Rays (Goli et al. 2024).
@@ -234,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn lives_and_labels_are_those_of_what_is_seen() {
+    fn lifespans_and_labels_are_those_of_visible_surfaces() {
         let [long, short] = shown(&number_columns(&instant(), &lifetimes(&scene())));
         assert!((long[0] - 1.0).abs() < 1e-5 && (0.1..0.5).contains(&short[0]), "{long:?} {short:?}");
         let [hand, nobody] = shown(&label_columns(&scene(), &instant()).unwrap());
@@ -255,7 +254,7 @@ mod tests {
         assert!((none[0] - 10.0).abs() < 1e-4 && (none[1] - 10.0).abs() < 1e-4);
         // One image states little of the depth, a second from the side states it.
         assert!(one[0] < none[0] && one[0] > 2.0 * both[0], "{one:?} {both:?}");
-        // What lives for a moment is not known better by an image of another time.
+        // An image of another time adds no information about short-lived Gaussians.
         let late = of(&[(&front, 0.5), (&side, 0.0)]);
         assert!(late[0] < 0.5 * one[0] && (late[1] / one[1] - 1.0).abs() < 1e-4, "{late:?}");
     }

@@ -1,4 +1,4 @@
-//! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that states why.
+//! The device that renders: the GPU where there is one that can, else the CPU, and a sentence that states why.
 
 mod resident;
 #[cfg(test)]
@@ -10,7 +10,8 @@ pub use resident::ResidentMotion;
 use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{
-    Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables, Target, Wanted,
+    Abilities, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables,
+    Target,
 };
 use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
@@ -37,25 +38,25 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
     /// It in words: of a GPU its driver too.
     pub name: String,
-    /// The device in words; where it is not the one that was asked for, the reason too.
+    /// The device in words; where it is not the requested one, the reason too.
     pub why: String,
-    /// Whether there is no GPU to draw on although one was asked for.
+    /// Whether there is no GPU to render on although one was requested.
     pub fell_back: bool,
 }
 
-/// The renderer of the CPU, which can do everything. It is compiled here, once for all crates that draw through a
+/// The renderer of the CPU, which can do everything. It is compiled here, once for all crates that render through a
 /// [`Backend`].
 pub fn cpu(config: RenderConfig) -> Box<dyn Backend> {
     Box::new(Renderer::new(config))
 }
 
-/// The device that was asked for, if it has the abilities in `wanted`, or else the CPU.
-pub fn open(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Opened {
+/// The requested device, if it has these abilities, or else the CPU.
+pub fn open(device: Device, config: RenderConfig, abilities: &Abilities, tables: Tables) -> Opened {
     if device == Device::Cpu {
         let why = format!("drawing on {CPU}");
         return Opened { backend: cpu(config), name: CPU.into(), why, fell_back: false };
     }
-    or_cpu(config, gpu(device, config, wanted, tables))
+    or_cpu(config, gpu(device, config, abilities, tables))
 }
 
 /// A GPU and its name, or, where there is none, the CPU and why.
@@ -66,11 +67,10 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
     }
 }
 
-/// The device that was asked for, with the CPU next to it: what the GPU cannot draw is drawn by the CPU, image by
-/// image,
-/// and a GPU that fails is left for good. Each is reported once ([`Backend::notice`]), and neither is an error.
+/// The requested device, together with the CPU, which renders what the GPU does not support, image by image, and a GPU
+/// that fails is not used again. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
-    let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
+    let opened = open(device, config, &Abilities { backward: true, ..Abilities::default() }, Tables::Changing);
     let why = opened.why.replacen("drawing", "training", 1);
     match device == Device::Cpu || opened.fell_back {
         true => Opened { why, ..opened },
@@ -78,12 +78,12 @@ pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     }
 }
 
-/// The CPU instead of the GPU that was asked for.
+/// The CPU instead of the requested GPU.
 pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
-    Opened { backend: cpu(config), name: CPU.into(), why: format!("drawing on {CPU}: {reason}"), fell_back: true }
+    Opened { backend: cpu(config), name: CPU.into(), why: format!("rendering on {CPU}: {reason}"), fell_back: true }
 }
 
-/// Draws. A backend that fails on the way is left for the CPU, which draws instead; its error is returned.
+/// Renders. If the backend fails, the CPU takes over and the error is returned.
 pub fn draw(backend: &mut Box<dyn Backend>, shot: &Shot<'_>, out: &mut Image) -> Option<Error> {
     let error = backend.render(shot, out).err()?;
     *backend = cpu(*backend.config());
@@ -98,10 +98,10 @@ struct WithCpu {
     cpu: Box<dyn Backend>,
     /// Whether the last image is the other's.
     drawn_by_other: bool,
-    /// What it was refused for.
+    /// Why it was refused.
     refused: Vec<String>,
     notices: Vec<String>,
-    /// Where an image that is drawn again goes.
+    /// Target of images that are rendered again.
     again: Image,
     name: String,
 }
@@ -120,10 +120,10 @@ impl WithCpu {
         }
     }
 
-    /// The other device, if it is there and can draw a shot and take it back.
+    /// The other device, if it is there and can render a shot and take it back.
     fn able(&mut self, shot: &Shot<'_>) -> Option<&mut Box<dyn Backend>> {
         let other = self.other.as_mut()?;
-        match other.can(&Wanted { backward: true, ..shot.wanted() }) {
+        match other.can(&Abilities { backward: true, ..shot.abilities() }) {
             Ok(()) => Some(other),
             Err(refusal) => {
                 let why = refusal.cause();
@@ -139,15 +139,15 @@ impl WithCpu {
     fn leave(&mut self, error: &Error) {
         self.other = None;
         self.name = CPU.into();
-        self.notices.push(format!("training goes on on the CPU: {}", error.cause()));
+        self.notices.push(format!("training continues on the CPU: {}", error.cause()));
     }
 }
 
 impl Backend for WithCpu {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, abilities: &Abilities) -> Result<()> {
         match &self.other {
-            Some(other) if wanted.compare => other.can(wanted),
-            _ => self.cpu.can(wanted),
+            Some(other) if abilities.compare => other.can(abilities),
+            _ => self.cpu.can(abilities),
         }
     }
 
@@ -233,7 +233,7 @@ const TEST_SIZE: [usize; 2] = [75, 45];
 /// roundings and a splat at the α cut-off, far below any mistake.
 const TRUSTED: [f64; 2] = [0.02, 0.05];
 
-/// Draws a little scene and takes it back, as the CPU does. Errors: something else comes out.
+/// Renders a small scene and runs the backward pass, as the CPU does. Errors: the results differ.
 #[cfg_attr(not(feature = "gpu"), allow(dead_code))]
 fn trusted(backend: &mut dyn Backend) -> Result<()> {
     let rng = Rng::new(1, "self-test", 0);
@@ -282,17 +282,22 @@ fn trusted(backend: &mut dyn Backend) -> Result<()> {
 }
 
 #[cfg(not(feature = "gpu"))]
-fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Backend>, String)> {
+fn gpu(_: Device, _: RenderConfig, _: &Abilities, _: Tables) -> Result<(Box<dyn Backend>, String)> {
     Err(Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`"))
 }
 
 #[cfg(feature = "gpu")]
-fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
-    // Cheap, where opening a driver takes a moment. The CPU is chosen without advice to choose it.
-    GpuRenderer::refuses(wanted).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
+fn gpu(
+    device: Device,
+    config: RenderConfig,
+    abilities: &Abilities,
+    tables: Tables,
+) -> Result<(Box<dyn Backend>, String)> {
+    // Cheap, where opening a driver takes a moment. The CPU is chosen without the advice to choose it.
+    GpuRenderer::refuses(abilities).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
     let open = || Gpu::open(adapters);
-    if wanted.backward {
+    if abilities.backward {
         return to_train(&open, config, tables, &mut trusted);
     }
     let gpu = open()?;
@@ -306,8 +311,8 @@ fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) ->
 #[cfg(feature = "gpu")]
 type SelfTest<'a> = &'a mut dyn FnMut(&mut dyn Backend) -> Result<()>;
 
-/// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither; that of the
-/// first is reported.
+/// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither;
+/// that of the first is reported.
 #[cfg(feature = "gpu")]
 fn to_train(
     open: &dyn Fn() -> Result<Gpu>,
@@ -324,7 +329,7 @@ fn to_train(
         Ok((Box::new(renderer), name))
     };
     tested(open()?).or_else(|error| {
-        // What subgroups do is the newest part of drivers.
+        // Subgroups are the newest part of drivers.
         let portable = open()?.tuned(Tuning { subgroups: false, ..Tuning::default() });
         tested(portable).map_err(|_| error)
     })

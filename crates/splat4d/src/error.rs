@@ -64,7 +64,7 @@ impl Error {
         self
     }
 
-    /// Says what to do; the first (innermost) remedy is kept.
+    /// Adds a remedy; the first (innermost) one is kept.
     #[must_use]
     pub fn remedy(mut self, remedy: impl Into<String>) -> Self {
         if self.remedy.is_empty() {
@@ -73,7 +73,7 @@ impl Error {
         self
     }
 
-    /// The class of trouble.
+    /// The class of the error.
     pub fn kind(&self) -> ErrorKind {
         self.kind
     }
@@ -92,7 +92,7 @@ impl Error {
         }
     }
 
-    /// Place and cause without the remedy: for lines that say what was done about it.
+    /// Place and cause without the remedy, for messages that state what was done about it.
     pub fn cause(&self) -> String {
         let place = if self.place.is_empty() { String::new() } else { format!("{}: ", self.place) };
         let source = self.source.as_ref().map_or_else(String::new, |source| format!(" ({source})"));

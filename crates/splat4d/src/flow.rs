@@ -1,8 +1,8 @@
 //! Scene flow: velocities of Gaussians, rendered 3D velocity, and rendered 2D flow between two times and cameras.
 //!
 //! A motion model already *is* scene flow; everything here is written once over [`Motion::at`] and
-//! [`Motion::velocity`](crate::motion::Motion::velocity) and drawn as further channels of the renderer, with the blend
-//! weights w_i = α_i T_i of the first time's image.
+//! [`Motion::velocity`](crate::motion::Motion::velocity) and rendered as further channels of the renderer, with the
+//! blend weights w_i = α_i T_i of the first time's image.
 //!
 //! [`Motion::at`]: crate::motion::Motion::at
 
@@ -20,7 +20,7 @@ use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
 /// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
 pub(crate) const FLOW_ALPHA_MIN: f64 = 1e-3;
 
-/// A scene at one time as a camera sees it.
+/// A scene at one time, seen by a camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a> {
     /// When.
@@ -40,7 +40,7 @@ pub struct Flow<F = f32> {
     pub image: Image<F>,
 }
 
-/// dμ/dt of every splat of `scene.at(t, instant)`, in the order of the splats: [splats, 3], scene units a second.
+/// dμ/dt of every splat of `scene.at(t, instant)`, in the order of the splats: [splats, 3], scene units per second.
 ///
 /// Panics: `instant` is not this scene's.
 pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F> {
@@ -48,7 +48,7 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
     let mut first = 0;
     for (layer, tape) in scene.layers.iter().zip(instant.tapes()) {
         let mut own = Table::default();
-        layer.motion.velocity(&tape.question(&layer.params), &mut own);
+        layer.motion.velocity(&tape.query(&layer.params), &mut own);
         for j in 0..own.rows() {
             let v = own.read::<3>(j, 0);
             let framed = || layer.frame.vector(v.map(F::f64)).map(F::of);
@@ -59,7 +59,7 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
     out
 }
 
-/// The velocity of what each pixel shows, in scene units a second: [3, h, w] world axes.
+/// The velocity of what each pixel shows, in scene units per second: [3, h, w] world axes.
 pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
     let mut instant = Evaluation::default();
     scene.at(shot.t, &mut instant);
@@ -82,10 +82,10 @@ pub fn velocity_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> T
 
 /// 2D flow in pixels, [2, h, w] (x right, y down): F(p) = Σ w_i [π_to(μ_i(t_to)) − π_from(μ_i(t_from))] / Σ w_i.
 ///
-/// The rows alive at `from.t` are followed to `to.t`, whatever their life states there. With the same camera twice it is
-/// the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no vector.
-/// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
-/// covariance term.
+/// The rows alive at `from.t` are followed to `to.t`, whatever their temporal opacity there. With the same camera for
+/// both it is the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no
+/// vector. Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without
+/// its covariance term.
 pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
     let mut start = Evaluation::default();
     scene.at(from.t, &mut start);
@@ -93,9 +93,8 @@ pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, rend
     draw(&scene.splats(&start), from.camera, scene.background, &extra, renderer)
 }
 
-/// The way of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or zeros
-/// for a
-/// splat that is behind a camera ([`divided`]).
+/// The displacement of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or
+/// zeros for a splat that is behind a camera ([`divided`]).
 ///
 /// Panics: `start` is not this scene's.
 pub fn flow_columns<F: Real>(scene: &Scene<F>, start: &Evaluation<F>, from: &Camera, to: Shot<'_>) -> Table<F> {
@@ -140,8 +139,8 @@ fn draw<F: Real>(
     Flow { vectors, weight, image }
 }
 
-/// Blended channels, of which the last is Σ w_i of the splats that have a value: the others over that, [C − 1, h, w], and
-/// it, [1, h, w]. Where it is small the values mean nothing.
+/// Blended channels, of which the last is Σ w_i of the splats that have a value: the others over that, [C − 1, h, w],
+/// and it, [1, h, w]. Where it is small the values mean nothing.
 pub fn divided<F: Real>(extra: &Planes<F>) -> (Planes<F>, Planes<F>) {
     let count = extra.channels - 1;
     let mut values = Planes::new(count, extra.height, extra.width);

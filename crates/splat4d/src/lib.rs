@@ -18,11 +18,11 @@
 //! ```
 //!
 //! The chain behind it is `motion.at → render`, and in training also `loss → render.vjp → motion.backward`. A motion
-//! model maps a time to [`scene::Splats`]; the renderer never sees time, a motion model never sees a pixel.
+//! model maps a time to [`scene::Splats`]; the renderer does not depend on time, a motion model not on pixels.
 //! [`layers::Evaluation`] evaluates a scene at many times at once and backpropagates; [`render::Backend`] is the
 //! interface of renderers; [`play::Player`] plays long scenes within a memory budget.
 //!
-//! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set (those are in `splat4d-train`).
+//! This crate reads bytes, not paths; it contains no loss, no optimiser and no data set (those are in `splat4d-train`).
 //!
 //! # Code map
 //!

@@ -1,5 +1,5 @@
-//! Plays a scene on the CPU: which Gaussians are alive at a time is looked up, not computed, and a playback file is read
-//! as time demands, within a budget of memory.
+//! Plays a scene on the CPU: which Gaussians are alive at a time is looked up, not computed, and a playback file is
+//! read as time demands, within a budget of memory.
 //!
 //! Like everything here it reads bytes, not paths: a file is whatever implements [`ReadAt`].
 
@@ -148,13 +148,13 @@ impl<'a> Held<'a> {
     }
 }
 
-/// Where layers come from that are not in memory.
+/// Source of layers that are not in memory.
 struct File {
     source: Box<dyn ReadAt + Send>,
     index: Index,
     /// Pages that have masks, and the sections of these, by page.
     masks: Vec<(u32, usize)>,
-    /// By section, read when a page first asks.
+    /// By section, read on first use by a page.
     palettes: Vec<(u32, Palette)>,
 }
 
@@ -167,7 +167,7 @@ pub struct Player<'a> {
     budget: usize,
     /// Places in `held` of what the last [`at`](Self::at) shows.
     shown: Vec<usize>,
-    /// Bytes read from the source so far.
+    /// Bytes read from the source.
     bytes_read: u64,
 }
 
@@ -194,8 +194,8 @@ impl<'a> Player<'a> {
         Self { file: None, meta, held, head, budget: usize::MAX, shown, bytes_read: 0 }
     }
 
-    /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
-    /// bytes; those that one time needs stay in any case.
+    /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to
+    /// `budget` bytes; those that one time needs stay in any case.
     ///
     /// Errors: those of [`Index::parse`] and of the source.
     pub fn open(mut source: Box<dyn ReadAt + Send>, length: u64, budget: usize) -> Result<Self> {
@@ -206,7 +206,7 @@ impl<'a> Player<'a> {
             if needed <= have as u64 {
                 break;
             }
-            // Beyond the end nothing is asked for: what is there states what is wrong with it.
+            // Beyond the end nothing is requested: reading reports the truncation.
             let want = needed.min(length) as usize;
             if want <= have {
                 break;
@@ -226,7 +226,7 @@ impl<'a> Player<'a> {
         &self.meta
     }
 
-    /// Bytes read so far, the index included.
+    /// Bytes read, the index included.
     #[cfg(test)]
     pub(crate) fn bytes_read(&self) -> u64 {
         self.bytes_read
@@ -244,7 +244,7 @@ impl<'a> Player<'a> {
 
     /// The splats at time t; a playback file's time is clamped to its clip.
     ///
-    /// Errors: a page that cannot be read. What was shown before is still held then.
+    /// Errors: a page that cannot be read. The previous pages stay in memory then.
     pub fn at(&mut self, t: Time) -> Result<Splats<'_>> {
         let clamp = self.file.is_some() || self.held.iter().any(|h| h.layer.span != ALWAYS);
         let t = if clamp { Time(t.0.max(self.meta.clip[0]).min(self.meta.clip[1])) } else { t };
@@ -262,7 +262,7 @@ impl<'a> Player<'a> {
         Ok(Splats { parts, head: self.head })
     }
 
-    /// Brings the pages of t into memory, and lets those farthest in time go where there is no room.
+    /// Brings the pages of t into memory, and drops those farthest in time when memory is full.
     fn load(&mut self, t: Time) -> Result<()> {
         let Some(file) = &mut self.file else { return Ok(()) };
         let wanted: Vec<(usize, Entry)> = file.index.pages_at(t.0).into_iter().map(|(i, e)| (i, e.clone())).collect();

@@ -1,9 +1,10 @@
 //! Which instructions the kernels may use, chosen once at run time.
 //!
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
-//! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ in
-//! the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under AVX-512). On ARM the baseline has NEON and fused multiply-add already.
-//! Everything that is fast goes through here: this is the one file of the workspace that states `unsafe`.
+//! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ
+//! in the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under
+//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here: this is the
+//! one file of the workspace that states `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -19,12 +20,12 @@ pub enum Simd {
     Avx512,
 }
 
-/// The level above which [`Simd::detect`] answers nothing.
+/// The highest level that [`Simd::detect`] returns.
 static LIMIT: AtomicU8 = AtomicU8::new(Simd::Avx512 as u8);
 
 impl Simd {
-    /// Lowers what [`detect`](Self::detect) answers from now on, in the whole process: tests and measurements of what lesser
-    /// machines compute. Matrix products (`nn::matmul`) choose their instructions themselves.
+    /// Lowers the result of [`detect`](Self::detect) from now on, in the whole process, for tests and measurements of
+    /// lesser machines compute. Matrix products (`nn::matmul`) choose their instructions themselves.
     pub fn limit(level: Self) {
         LIMIT.store(level as u8, Ordering::Relaxed);
     }
@@ -38,7 +39,7 @@ impl Simd {
         }
     }
 
-    /// What files and reports call it. NEON is what every 64-bit ARM machine has.
+    /// Its name in files and reports. Every 64-bit ARM machine has NEON.
     pub fn name(self) -> &'static str {
         match self {
             Simd::Scalar if cfg!(target_arch = "aarch64") => "neon",
@@ -83,13 +84,13 @@ pub trait Kernel {
     }
 }
 
-/// Work that writes to two things that the caller lends. They are arguments of the compiled function itself, since only
-/// then does LLVM know that they do not overlap with what is read: plain loops over slices that stand inside a
-/// [`Kernel`] stay scalar (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
+/// Work that writes to two buffers of the caller. They are arguments of the compiled function itself, since only then
+/// can LLVM assume that they do not overlap with the inputs: plain loops over slices inside a [`Kernel`] stay scalar
+/// (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
 pub trait Pass {
     /// Working memory.
     type Scratch: ?Sized;
-    /// Where results go.
+    /// Destination of results.
     type Into: ?Sized;
     /// Its result.
     type Out;
@@ -136,8 +137,8 @@ pub fn each<T: Copy + Default, const N: usize>(f: impl Fn(usize) -> T) -> [T; N]
     out
 }
 
-/// The sum of sixteen numbers, as a tree: the same for every level and thread. Its steps are written out, since a loop over
-/// them stays one under AVX-512.
+/// The sum of sixteen numbers, as a tree: the same for every level and thread. Its steps are written out, since a loop
+/// over them stays one under AVX-512.
 #[inline(always)]
 pub(crate) fn total<T: Copy + Default + std::ops::Add<Output = T>>(x: [T; 16]) -> T {
     let eight: [T; 8] = each(|i| x[i] + x[i + 8]);
@@ -157,7 +158,7 @@ pub(crate) fn greatest<T: PartialOrd>(a: T, b: T) -> T {
     if a > b { a } else { b }
 }
 
-/// One of two values that are both at hand. Without the hint LLVM makes a branch of it, and of the branch a masked
+/// One of two values that are both available. Without the hint LLVM makes a branch of it, and of the branch a masked
 /// store, which costs tens of cycles.
 #[inline(always)]
 pub(crate) fn select<T>(condition: bool, yes: T, no: T) -> T {

@@ -1,12 +1,12 @@
-//! Text that comes from files, made safe to show: titles, notes, names of cameras, labels and files.
+//! Text from files, made safe to display: titles, notes, names of cameras, labels and files.
 //!
 //! A terminal obeys control characters: an escape sequence in a title could set the clipboard or clear the screen, and
 //! formatting characters for bidirectional text could reorder what is read. Who prints passes everything through here.
 
 use std::borrow::Cow;
 
-/// Formatting characters that change the direction of text (Unicode 15, UAX #9): embeddings, overrides and isolates, marks;
-/// and the separators of lines and paragraphs.
+/// Formatting characters that change the direction of text (Unicode 15, UAX #9): embeddings, overrides and isolates,
+/// marks; and the separators of lines and paragraphs.
 const DIRECTIONS: [std::ops::RangeInclusive<char>; 4] =
     ['\u{200E}'..='\u{200F}', '\u{2028}'..='\u{202E}', '\u{2066}'..='\u{2069}', '\u{061C}'..='\u{061C}'];
 
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_terminal_would_obey_is_spelt_out() {
+    fn terminal_control_characters_are_escaped() {
         let title = "knight\u{1b}]52;c;ZXZpbA==\u{7}\u{9b}2J\rname\u{202e}gpj.exe";
         let shown = shown(title);
         assert!(!shown.chars().any(acts), "{shown}");

@@ -25,9 +25,9 @@ pub(crate) const TILES: &str = include_str!("gpu/tiles.wgsl");
 pub(crate) const RANGES: &str = include_str!("gpu/ranges.wgsl");
 /// Blends to colour, alpha and depth. After `PROJECT`.
 pub(crate) const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
-/// Planes → 8 bits a channel. After `PROJECT`.
+/// Planes → 8 bits per channel. After `PROJECT`.
 pub(crate) const BYTES: &str = include_str!("gpu/bytes.wgsl");
-/// What both ways back of the blend share. After `PROJECT`.
+/// Shared code of both backward passes of the blend. After `PROJECT`.
 pub(crate) const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
 /// Sums over subgroups. After `BLEND_BACK`.
 pub(crate) const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
@@ -39,7 +39,7 @@ pub(crate) const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_
 pub(crate) const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub(crate) const LOSS: &str = include_str!("gpu/loss.wgsl");
-/// Learnable rows at time t, and their lives. Reads `params`, which the including shader binds.
+/// Learnable rows at time t, and their lifespans. Reads `params`, which the including shader binds.
 pub(crate) const LEARNT: &str = include_str!("gpu/learnt.wgsl");
 /// Writes a row's gradients. After `LEARNT`.
 pub(crate) const PUT: &str = include_str!("gpu/put.wgsl");
@@ -53,7 +53,7 @@ pub(crate) const SLICE_ANSWER: &str = include_str!("gpu/slice_answer.wgsl");
 pub(crate) const SLICE_BACK: &str = include_str!("gpu/slice_back.wgsl");
 /// Losses on rows: `count_rows`, `row_losses`. After `LEARNT` and `NUMBERS`.
 pub(crate) const ROW_LOSSES: &str = include_str!("gpu/row_losses.wgsl");
-/// What holds the poses of a tracked frame: `turns_of`, `hold`. After `LEARNT`.
+/// Ties of the poses of a tracked frame: `turns_of`, `hold`. After `LEARNT`.
 pub(crate) const TIES: &str = include_str!("gpu/ties.wgsl");
 /// Noise on positions. After `LEARNT` and `NUMBERS`.
 pub(crate) const SHAKE: &str = include_str!("gpu/shake.wgsl");
@@ -63,7 +63,7 @@ pub(crate) const ANSWER: &str = include_str!("gpu/answer.wgsl");
 pub(crate) const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
 /// Gradients of colours → those of SH and means, and statistics. After `PROJECT`, `SHADE` and `LEARNT`.
 pub(crate) const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
-/// What a step leaves of itself: `view_sums`, `cameras`, `record`.
+/// Record of a step: `view_sums`, `cameras`, `record`.
 pub(crate) const RECORD: &str = include_str!("gpu/record.wgsl");
 /// A step of Adam on one table.
 pub(crate) const ADAM: &str = include_str!("gpu/adam.wgsl");
@@ -86,7 +86,7 @@ mod tests {
     const STORAGE_BUFFERS: usize = 8;
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
-    /// Those that need more than WebGPU's core, on devices that have it.
+    /// Those that need more than WebGPU's core.
     const SUBGROUPS: [&str; 3] = [
         "rasterize, backward, with subgroups",
         "sort with subgroups",

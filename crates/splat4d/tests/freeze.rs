@@ -1,4 +1,4 @@
-//! A moving scene at one moment as plain Gaussians.
+//! A dynamic scene at one time as plain Gaussians.
 
 use splat4d::layers::{Evaluation, Layer, Scene, freeze};
 use splat4d::math::Rng;

@@ -1,6 +1,5 @@
 //! Times of a GPU: every stage of an image and of its backward pass by the GPU's own clock, and whole training steps in
-//! which it
-//! draws.
+//! which it renders.
 
 use super::roofline::bytes;
 use super::rows::Row;
@@ -36,8 +35,8 @@ const SORT: usize = 20;
 const DEPTH_PASSES: usize = 4;
 const TILE_PASSES: usize = 2;
 
-/// Stages in the order in which they run. The last of a way, `memory to memory`, is the whole call, with the upload and what is
-/// read back.
+/// Stages in the order in which they run. The last of a way, `memory to memory`, is the whole call, with the upload and
+/// what is read back.
 const STAGES: [&str; 13] = [
     "upload",
     "project",
@@ -98,11 +97,11 @@ const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
 /// A whole training step; a frame of a film.
 const STEP: &str = "step";
 const FILM: &str = "frame, nothing read back";
-/// Frames of a film, times the rounds, of which there are five by default; and how often it is drawn at most: the best
-/// counts.
+/// Frames of a film, times the rounds, of which there are five by default; and how often it is rendered at most: the
+/// best counts.
 const FRAMES: usize = 200;
 const FILMS: usize = 3;
-/// How far a camera looks to either side, radians: five degrees.
+/// How far a camera turns to either side, radians: five degrees.
 const SWING: f64 = 0.087;
 /// Stages that only whole training steps on the GPU have.
 const OF_STEPS: [&str; 4] = ["answer", "loss", "answer backward", "adam"];
@@ -117,8 +116,8 @@ fn renderer(tuning: Tuning) -> Result<GpuRenderer> {
     Ok(renderer)
 }
 
-/// Draws every view of every scene and takes it back, and trains a few steps, with each of these constants of the kernels; the defaults
-/// come first. Errors: there is no GPU of any kind.
+/// Renders every view of every scene and takes it back, and trains a few steps, with each of these constants of the
+/// kernels; the defaults come first. Errors: there is no GPU of any kind.
 pub(super) fn measure(
     scenes: &[Pinned],
     way: Way,
@@ -133,7 +132,7 @@ pub(super) fn measure(
     note(&format!("{name}: at best {:.2} G pairs/s and {:.1} GB/s", best.pairs * 1e-9, best.bytes * 1e-9));
     let mut rows: Vec<Row> = Vec::new();
     for pinned in scenes {
-        // Truth is drawn by the CPU, once.
+        // Truth is rendered by the CPU, once.
         let held = Arc::new(pool.install(|| Held::of(pinned, way)));
         for tuning in tunings {
             let changes = tuning.changes();
@@ -225,8 +224,8 @@ fn stages(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, best: &GpuRoofl
     Ok(STAGES.iter().enumerate().map(row).collect())
 }
 
-/// Whole training steps on the GPU: those of their stages that drawing alone does not have, of steps that are waited for one by
-/// one; and the whole, of rounds in which the GPU is never waited for but at their ends.
+/// Whole training steps on the GPU: those of their stages that rendering alone does not have, of steps that are waited
+/// for one by one; and the whole, of rounds in which the GPU is never waited for but at their ends.
 fn steps(
     pinned: &Pinned,
     held: &Arc<Held>,
@@ -300,7 +299,7 @@ fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -
     let times: Vec<Time> = path.iter().map(|p| p.1).collect();
     let known: Option<Vec<_>> = pinned.scene.layers.iter().map(|l| ResidentMotion::new(l, &times)).collect();
     let Some(known) = known else { return Ok(Vec::new()) };
-    // Three columns a row, in blocks of sixteen.
+    // Three columns per row, in blocks of sixteen.
     let stats: Vec<Vec<f32>> =
         pinned.scene.layers.iter().map(|l| vec![0.0; 3 * l.params.len().next_multiple_of(16)]).collect();
     fn kept<'a>(((layer, known), stats): ((&'a Layer, &ResidentMotion), &'a Vec<f32>)) -> ResidentLayer<'a> {
@@ -323,7 +322,8 @@ fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -
     Ok(vec![Row { ceiling_share: Some(floor / best), ..row }])
 }
 
-/// The camera and the time after a share of the film: every view in turn, of which each looks from side to side, through the whole clip.
+/// The camera and the time after a share of the film: every view in turn, of which each turns from side to side,
+/// through the whole clip.
 fn along(pinned: &Pinned, share: f64) -> (Camera, Time) {
     let place = share * pinned.views.len() as f64;
     let mut camera = pinned.views[place as usize].camera.clone();

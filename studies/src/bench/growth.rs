@@ -1,10 +1,10 @@
-//! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with a
-//! million Gaussians.
+//! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with
+//! a million Gaussians.
 //!
-//! The image stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
-//! widened, so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of
-//! its scales, and is where chance puts it inside the parent. All have the default recipe's model: one velocity each
-//! and a Gaussian life.
+//! The image stays the same. More Gaussians are those of the trained scene split, fewer are every n-th of them widened,
+//! so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of its
+//! scales, and is where chance puts it inside the parent. All have the default recipe's model: one velocity each and a
+//! Gaussian life.
 
 use super::rows::Row;
 use super::scenes::{Pinned, VIEWS, View};
@@ -59,7 +59,7 @@ const STEPS: usize = 60;
 /// As the bundled capture's images.
 const JPEG_QUALITY: u8 = 90;
 
-/// Measures what was asked for, in a pool of `way.threads` threads.
+/// Measures the requested quantities, in a pool of `way.threads` threads.
 pub(super) fn measure(
     base: &Pinned,
     axes: &[Axis],
@@ -132,11 +132,11 @@ fn own_degree(base: &Pinned) -> usize {
     sh::degree_of(columns / 3).unwrap_or(0)
 }
 
-/// Steps on a capture of `count` images, on disk, through the trainer's own store: the first look at each decodes it.
+/// Steps on a capture of `count` images, on disk, through the trainer's own store: the first use of each decodes it.
 fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, base.scene.len(), own_degree(base), side);
     let folder = Folder::new()?;
-    let pictures = write_pictures(&folder.0, Held::of(&pinned, way).pictures())?;
+    let pictures = write_images(&folder.0, Held::of(&pinned, way).pictures())?;
     let capture = capture(&pinned, &folder.0, &pictures, count);
     let train = capture.train.clone();
     let store = Arc::new(ImageStore::new(Arc::new(capture), Recipe::default().run.image_memory as usize));
@@ -155,7 +155,7 @@ fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>
     Ok(vec![step, load])
 }
 
-/// A synthetic capture: eight image files, each of which stands for every eighth frame.
+/// A synthetic capture: eight image files, each of which represents every eighth frame.
 fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> Capture {
     let clip = pinned.scene.clip;
     let frame = |i: usize| {
@@ -209,7 +209,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
     }
 }
 
-fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf>> {
+fn write_images(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf>> {
     let write = |(i, picture): (usize, &Planes<f32>)| {
         let path = folder.join(format!("{i}.jpg"));
         let bytes: Vec<u8> = picture.interleaved().iter().map(|x| (255.0 * x).round() as u8).collect();
@@ -223,7 +223,7 @@ fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf
     pictures.iter().enumerate().map(write).collect()
 }
 
-/// A folder of this process that goes when it is dropped.
+/// A folder of this process that is deleted when dropped.
 struct Folder(PathBuf);
 
 impl Folder {
@@ -240,7 +240,7 @@ impl Drop for Folder {
     }
 }
 
-/// Where the memory of training is: what tables hold, what the renderer holds after a step, and the process's peak.
+/// Memory of training by owner: what tables hold, what the renderer holds after a step, and the process's peak.
 fn memory(base: &Pinned, count: usize, degree: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, count, degree, side);
     let columns: usize = pinned.scene.layers[0].params.keys().map(|k| pinned.scene.layers[0].params[k].width()).sum();
@@ -263,7 +263,7 @@ fn memory(base: &Pinned, count: usize, degree: usize, side: usize, way: Way) -> 
     ])
 }
 
-/// Bytes of a renderer that drew every view and went back.
+/// Bytes of a renderer that rendered every view and went back.
 fn renderer_bytes(pinned: &Pinned, way: Way) -> u64 {
     let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     let (mut image, mut d) = (Image::default(), RenderGrads::default());
@@ -303,7 +303,7 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
         from.layers.iter().flat_map(|l| (0..l.params.len()).map(move |row| (l, row))).collect();
     let [geometry, colors, lives, speeds] = params.get_mut([GEOMETRY, SH, LIFE, velocities]);
     for child in 0..count {
-        // Children of one parent stand together, so that the order in space stays.
+        // Children of one parent are together, so that the order in space stays.
         let (layer, row) = parents[child * had / count];
         let p = &layer.params;
         let mut g = p[GEOMETRY].read::<11>(row, 0);
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn a_split_scene_has_as_many_gaussians_as_asked_and_covers_what_it_covered() {
+    fn a_split_scene_has_the_requested_count_and_the_same_coverage() {
         let base = small();
         let many = split(&base.scene, 40 * 500, 3);
         assert_eq!((many.len(), many.layers[0].params[SH].width()), (20_000, 48));

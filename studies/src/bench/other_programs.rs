@@ -45,7 +45,7 @@ const RATES: [RateOf; 6] = [
 const SCENE: &str = "scene.json";
 const OURS: &str = "splat4d.json";
 
-/// What a program reports of its run.
+/// Report of a program's run.
 #[derive(Debug, Serialize, Deserialize)]
 struct Ran {
     program: String,
@@ -56,7 +56,7 @@ struct Ran {
     losses: Vec<f64>,
 }
 
-/// The limits that other programs draw with.
+/// The limits of other programs' renderers.
 pub(super) fn config() -> RenderConfig {
     RenderConfig { alpha_max: ALPHA_MAX, ..RenderConfig::default() }
 }
@@ -152,7 +152,7 @@ fn learn(pinned: &Pinned, held: &Arc<Held>, backend: Box<dyn Backend>, device: &
     Ok((Ran { program: "splat4d".into(), device: device.into(), ms, losses }, order))
 }
 
-/// Where two runs do not agree.
+/// Disagreement of two runs.
 fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     AGREE.iter().find_map(|&(step, most)| {
         let of = |ran: &Ran| ran.losses.get(step - 1).copied().unwrap_or(f64::NAN);
@@ -163,7 +163,7 @@ fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     })
 }
 
-/// What is to be said of all other programs whose runs are in a scene's folder.
+/// Report of all other programs whose runs are in a scene's folder.
 fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     let unread = |e: std::io::Error| Error::io("the folder cannot be read", e).at(folder.display());
     let mut paths: Vec<_> = std::fs::read_dir(folder).map_err(unread)?.flatten().map(|entry| entry.path()).collect();
@@ -190,7 +190,8 @@ fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     paths.iter().filter(other).map(verdict).collect()
 }
 
-/// Writes a scene into a folder of its name, trains it with `backend`, and prints how it compares with programs that were measured before.
+/// Writes a scene into a folder of its name, trains it with `backend`, and prints how it compares with programs that
+/// were measured before.
 pub(super) fn measure(
     pinned: &Pinned,
     folder: &Path,
@@ -231,7 +232,7 @@ mod tests {
                 return println!("skipped: {e}");
             }
         };
-        // The CPU stands for another program.
+        // The CPU represents another program.
         let folder = place.path().join("small");
         let cpu = || splat4d::device::cpu(config());
         assert!(measure(&pinned, place.path(), way, cpu(), "the CPU").unwrap().1.is_empty(), "nobody else is there");

@@ -21,7 +21,7 @@ pub(super) struct Played {
     side: Side,
 }
 
-/// Measures in turns, with all threads of the current pool.
+/// Measures alternately, with all threads of the current pool.
 pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) -> Result<Vec<Played>> {
     let sources = files.iter().map(|f| Opened::new(f)).collect::<Result<Vec<_>>>()?;
     // Frame rates compare only where the images do: all are seen from the first one's cameras that has some.
@@ -68,7 +68,7 @@ impl Opened {
     }
 }
 
-/// An array, a row a line.
+/// An array, a row per line.
 pub(super) fn json(rows: &[Played]) -> String {
     let lines: Vec<String> = rows.iter().map(|r| serde_json::to_string(r).expect("rows are plain data")).collect();
     format!("[\n{}\n]", lines.join(",\n"))

@@ -1,8 +1,8 @@
 //! The machine's roofline, and the work that a stage cannot do without.
 //!
 //! A stage's floor is the time in which its compulsory work is done at the roofline: pairs of pixel and Gaussian at the
-//! speed of the blend's arithmetic alone, bytes at the speed of memory. Bytes are those that a stage must read and write
-//! once if it starts and ends in memory; small scenes stay in the caches, and may beat it.
+//! speed of the blend's arithmetic alone, bytes at the speed of memory. Bytes are those that a stage must read and
+//! write once if it starts and ends in memory; small scenes stay in the caches, and may beat it.
 
 use splat4d::layers::{Layer, Scene};
 use splat4d::render::roofline;
@@ -14,7 +14,7 @@ use splat4d::scene::Splats;
 pub(super) struct Roofline {
     /// Pairs of pixel and Gaussian a second, all threads together.
     pub pairs: f64,
-    /// Bytes a second.
+    /// Bytes per second.
     pub bytes: f64,
 }
 

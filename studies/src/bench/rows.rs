@@ -1,4 +1,4 @@
-//! What was measured: rows, and the three forms in which they are printed.
+//! Measurements: rows, and the three forms in which they are printed.
 
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, Result};
@@ -52,14 +52,14 @@ pub(super) struct Row {
 }
 
 impl Row {
-    /// Whether two rows measure the same thing.
+    /// Whether two rows measure the same quantity.
     fn twin(&self, other: &Self) -> bool {
         let key = |r: &Self| (r.threads, r.x.map(f64::to_bits), r.tuning.clone());
         self.scene == other.scene && self.stage == other.stage && self.simd == other.simd && key(self) == key(other)
     }
 }
 
-/// An array, a row a line.
+/// An array, a row per line.
 pub(super) fn json(rows: &[Row]) -> String {
     let lines: Vec<String> =
         rows.iter().map(|r| serde_json::to_string(r).expect("a row is plain data with names")).collect();
@@ -108,7 +108,7 @@ fn distinct<T: PartialEq>(values: impl Iterator<Item = T>) -> Vec<T> {
     out
 }
 
-/// A line for each thing that grew and how far, with its stages side by side; a line for each place where memory is.
+/// A line for each quantity and size, with its stages side by side; a line for each place where memory is.
 fn grown_cells(rows: &[Row]) -> Vec<Vec<String>> {
     let stages = distinct(rows.iter().filter(|r| r.bytes.is_none()).map(|r| r.stage.as_str()));
     let memory = rows.iter().any(|r| r.bytes.is_some());
@@ -224,7 +224,7 @@ pub(super) fn table(rows: &[Row]) -> String {
         let mut text = String::new();
         for (c, cell) in line.iter().enumerate() {
             let w = widths[c];
-            // Names and remarks stand left, numbers right.
+            // Names and remarks are left-aligned, numbers right-aligned.
             let _ = if c < 2 || c + 1 == columns { write!(text, "{cell:<w$}  ") } else { write!(text, "{cell:>w$}  ") };
         }
         let _ = writeln!(out, "{}", text.trim_end());

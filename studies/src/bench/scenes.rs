@@ -70,7 +70,7 @@ impl Name {
     }
 }
 
-/// Where scenes lie, if not in their usual places.
+/// Folder of scenes, if not the usual one.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Places {
     pub playbot: Option<PathBuf>,
@@ -105,7 +105,7 @@ pub(super) struct Pinned {
 pub(super) struct Skipped(pub String);
 
 impl Pinned {
-    /// Reads a scene. The inner error states that its file is not there, which is no fault.
+    /// Reads a scene. The inner error states that its file is not there, which is not a fault.
     pub(super) fn open(name: Name, places: &Places) -> Result<std::result::Result<Self, Skipped>> {
         if let Some((count, size)) = name.made() {
             return Ok(Ok(made_up(name.letter(), count, size)));
@@ -193,7 +193,7 @@ fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>
 }
 
 /// The pages of a playback file as the one layer that they were before they were baked. Layers that differ in their
-/// motion, their life or their span stay apart.
+/// motion, their lifespan or their span stay apart.
 fn in_one_layer(mut scene: Scene<f32>) -> Scene<f32> {
     let [first, rest @ ..] = &scene.layers[..] else { return scene };
     let widths = |l: &Layer| l.params.keys().map(|k| l.params[k].width()).collect::<Vec<_>>();

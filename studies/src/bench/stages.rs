@@ -1,4 +1,4 @@
-//! Times of drawing: the motion at a time, the renderer's stages, and their backward pass.
+//! Times of rendering: the motion at a time, the renderer's stages, and their backward pass.
 
 use super::roofline::{Roofline, bytes};
 use super::rows::Row;
@@ -14,7 +14,7 @@ use std::time::Instant;
 pub(super) struct Way {
     pub threads: usize,
     pub simd: Simd,
-    /// Rounds over all views, after one that makes room.
+    /// Rounds over all views, after a warm-up round.
     pub rounds: usize,
 }
 
@@ -61,7 +61,7 @@ pub(super) fn gradient(view: &View) -> Planes<f32> {
     grad
 }
 
-/// One table a part, where its colours are the layer's own.
+/// One table per part, where its colours are the layer's own.
 pub(super) fn zeros(splats: &Splats<'_, f32>) -> Vec<Option<Table<f32>>> {
     let table = |color: Color<'_, f32>| match color {
         Color::Sh { table, base: true, .. } => Some(table.zeros_like()),
@@ -70,7 +70,7 @@ pub(super) fn zeros(splats: &Splats<'_, f32>) -> Vec<Option<Table<f32>>> {
     splats.parts.iter().map(|p| table(p.color)).collect()
 }
 
-/// Draws every view again and again. Call it inside a pool of `way.threads` threads.
+/// Renders every view again and again. Call it inside a pool of `way.threads` threads.
 pub(super) fn measure(pinned: &Pinned, way: Way, roofline: &Roofline) -> Result<Vec<Row>> {
     let config = RenderConfig { simd: way.simd, ..RenderConfig::default() };
     let (mut renderer, mut image) = (Renderer::new(config), Image::default());

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Every rate is multiplied by this: the scene stays what it is, the work is the same.
+/// Every rate is multiplied by this: the scene does not change, the work is the same.
 const STANDSTILL: f64 = 1e-6;
 /// Steps of the stage: never reached.
 const FOR_EVER: usize = 1 << 40;
@@ -137,7 +137,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     let mut stages = recipe.program()?.stages(&plan);
     let mut stage = stages.swap_remove(0);
     (stage.iterations, stage.sh_interval, stage.half_size_steps) = (FOR_EVER, 0, 0);
-    // Programs speak of layer 0; here all layers learn.
+    // Programs refer to layer 0; here all layers learn.
     let of_first = std::mem::take(&mut stage.groups);
     for layer in 0..scene.layers.len() {
         stage.groups.extend(of_first.iter().map(|g| Group { layer, ..g.clone() }));
@@ -145,13 +145,13 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     Ok(stage)
 }
 
-/// A trainer that goes on for ever and changes next to nothing.
+/// A trainer that continues forever and changes next to nothing.
 pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> Result<Trainer<'static>> {
     let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     trainer_on(scene, frames, Box::new(renderer))
 }
 
-/// The same, drawn by `backend`.
+/// The same, rendered by `backend`.
 pub(super) fn trainer_on(
     scene: Scene<f32>,
     frames: Arc<dyn Frames>,

@@ -11,7 +11,7 @@ pub(crate) struct Variant {
     /// For people.
     pub name: &'static str,
     settings: &'static [&'static str],
-    /// Whether a glance looks at it too.
+    /// Whether the quick study includes it.
     quick: bool,
 }
 
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn variants_differ_in_what_they_set_alone() {
+    fn variants_differ_only_in_their_settings() {
         use splat4d::motion::filtered::Fusion;
         let base = Recipe::default().with(|r| r.filter.fusion = Fusion::Literal);
         let all = variants(false);

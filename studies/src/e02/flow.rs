@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// Code of no displacement, and codes a pixel (Geiger et al. 2012, KITTI).
 const ZERO: f64 = 32_768.0;
 const STEPS: f64 = 64.0;
-/// Flow of fewer pixels is that of things that are static.
+/// Flow of fewer pixels is that of static objects.
 const MOVING: f64 = 1.0;
 /// An image that is less opaque has no flow to compare.
 const OPAQUE: f32 = 0.5;
@@ -23,7 +23,7 @@ const OPAQUE: f32 = 0.5;
 pub(crate) struct FlowError {
     /// Over all pixels that have a truth.
     pub all: f64,
-    /// Where the truth is at least a pixel long.
+    /// Pixels with true flow of at least a pixel.
     pub moving: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! What the ablation found, as a table and a curve.
+//! Results of the ablation, as a table and a curve.
 
 use super::cells::Variant;
 use super::{FolderContent, Study};

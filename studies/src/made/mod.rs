@@ -18,7 +18,7 @@ use splat4d_workflow::files;
 use std::path::Path;
 use world::{Pinhole, V3};
 
-/// The generator's version: drawings of another are drawn again.
+/// The generator's version: drawings of another are rendered again.
 pub(crate) const VERSION: usize = 2;
 /// Codes of depth a world unit, in images of 16 bits: depths to 16 units.
 const DEPTH_CODES: f64 = 4096.0;
@@ -31,12 +31,12 @@ const SEED: u64 = 18;
 const POINTS: usize = 500;
 /// Cosine of the least angle between two rays to a point: COLMAP keeps no point below 1.5°.
 const PARALLAX: f64 = 0.999_657;
-/// A point counts as seen where what its pixel shows is at most this share of its distance nearer.
+/// A point counts as seen if the depth at its pixel is smaller by at most this share.
 const SEEN: f64 = 0.01;
-/// Error of a point along each axis, pixels at its distance, at most: what good structure from motion has.
+/// Error of a point along each axis, pixels at its distance, at most: as from good structure from motion.
 const NOISE: f64 = 0.5;
 
-/// Draws a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
+/// Renders a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
 ///
 /// Errors: there is none of this name; files that cannot be written.
 pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
@@ -148,8 +148,8 @@ fn description(name: &str, scene: &Scene) -> Value {
 /// A coloured point, in the world's units.
 type Point = (V3, [u8; 3]);
 
-/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of
-/// a moving camera: of all times), kept where a second training image sees the place from a different direction.
+/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of a
+/// moving camera: of all times), kept where a second training image sees the point from a different direction.
 fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =
@@ -163,7 +163,7 @@ fn cloud(scene: &Scene) -> Vec<Point> {
         let (camera, moment) = views[rng.below(0, views.len())];
         let place = [rng.uniform(1) * camera.size[0] as f64, rng.uniform(2) * camera.size[1] as f64];
         let (eye, ray) = (camera.center(), camera.ray(place));
-        let Some(seen) = scene.world.look(eye, ray, share(moment, scene.moments)) else { continue };
+        let Some(seen) = scene.world.cast(eye, ray, share(moment, scene.moments)) else { continue };
         let moves = scene.world.things[seen.thing].moves;
         if moves && !scene.moving_points {
             continue;
@@ -173,7 +173,7 @@ fn cloud(scene: &Scene) -> Vec<Point> {
             let far = norm(to);
             let sight = to.map(|x| x / far);
             let there = || {
-                let own = scene.world.look(other.center(), sight, share(at, scene.moments));
+                let own = scene.world.cast(other.center(), sight, share(at, scene.moments));
                 own.is_some_and(|s| norm(sub(s.point, other.center())) > far * (1.0 - SEEN))
             };
             dot(sight, ray) < PARALLAX && other.project(seen.point).is_some() && there()
@@ -245,7 +245,7 @@ mod tests {
         assert!(write("two-walls", Path::new("nowhere")).unwrap_err().to_string().contains("one-wall"));
     }
 
-    /// What every name is made of, without drawing it whole: a small image, the points and the description.
+    /// Content of every capture, without rendering it whole: a small image, the points and the description.
     fn print_of(name: &str) -> String {
         let scene = scene(name).unwrap();
         let (viewer, moment) = (&scene.viewers[scene.viewers.len() - 1], scene.moments / 2);
@@ -257,9 +257,9 @@ mod tests {
     }
 
     #[test]
-    fn the_same_bytes_come_out_everywhere() {
+    fn the_same_bytes_on_every_machine() {
         let all: Vec<String> = NAMES.iter().map(|(name, _)| format!("{name} {}", print_of(name))).collect();
-        // A change of what is drawn must also change `VERSION`, so that old drawings are not taken for new ones.
+        // A change of what is rendered must also change `VERSION`, so that old drawings are not taken for new ones.
         assert_eq!((VERSION, all.join("\n")), (2, PRINTS.trim().to_owned()));
     }
 
@@ -289,14 +289,14 @@ hand-held-60 36359dac295000bb
             for draw in 0..200 {
                 let rng = Rng::new(1, "test", draw);
                 let place = [rng.uniform(0) * 160.0, rng.uniform(1) * 120.0];
-                let seen = scene.world.look(path.at(moment).center(), path.at(moment).ray(place), at).unwrap();
+                let seen = scene.world.cast(path.at(moment).center(), path.at(moment).ray(place), at).unwrap();
                 let Some([x, y]) = fixed.at(moment).project(seen.point) else { continue };
                 let eye = fixed.at(moment).center();
                 let to = sub(seen.point, eye);
                 let sight = to.map(|v| v / norm(to));
-                let there = scene.world.look(eye, sight, at).unwrap();
+                let there = scene.world.cast(eye, sight, at).unwrap();
                 if norm(sub(there.point, seen.point)) > 1e-6 {
-                    continue; // something stands before it
+                    continue; // something is before it
                 }
                 let pixel = |picture: &[u8], [x, y]: [f64; 2]| -> V3 {
                     std::array::from_fn(|k| f64::from(picture[3 * (y as usize * 160 + x as usize) + k]) / 255.0)
@@ -307,8 +307,8 @@ hand-held-60 36359dac295000bb
                 }
             }
         }
-        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of places that have
-        // nothing to do with each other differ by 0.3.
+        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of positions that
+        // have nothing to do with each other differ by 0.3.
         let mean = off / f64::from(compared);
         assert!(mean < 0.04, "{mean}");
         assert!(compared > 200, "{compared} places are seen by both");
@@ -329,14 +329,14 @@ hand-held-60 36359dac295000bb
         let angle = dot(own.cam_from_world.rotation[2], told.cam_from_world.rotation[2]).acos().to_degrees();
         assert!((angle - 3.0).abs() < 1e-9 && norm(sub(own.center(), told.center())) < 1e-12);
         assert!(told.cam_from_world.orthogonality_error() < 1e-12 && !camera.held);
-        // What enters is in no image of the first half, and in all of the last.
+        // The entering object is in no image of the first half, and in all of the last.
         let enters = of("enters");
         let number = enters.world.things.len() - 1;
         let shown = |viewer: &Viewer, moment: usize| {
             let at = share(moment, enters.moments);
             let camera = viewer.at(moment);
             let sees = |x: usize, y: usize| {
-                let seen = enters.world.look(camera.center(), camera.ray([x as f64, y as f64]), at);
+                let seen = enters.world.cast(camera.center(), camera.ray([x as f64, y as f64]), at);
                 seen.is_some_and(|s| s.thing == number)
             };
             (0..160).step_by(4).any(|x| (0..120).step_by(4).any(|y| sees(x, y)))

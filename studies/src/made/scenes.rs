@@ -1,20 +1,18 @@
-//! The synthetic captures: what is there, who looks at it, and what is hard about it. Nothing here was chosen by how
-//! well it
-//! is learnt.
+//! The synthetic captures: contents, cameras and difficulty. Nothing here was chosen by how well it is learnt.
 
 use super::world::{Pinhole, Shape, Texture, Thing, V3, World, sin_cos};
 use splat4d::math::Se3;
 
-/// Images, pixels; the focal length gives 59° across, as an ordinary camera has it.
+/// Images, pixels; the focal length gives 59° across, as of an ordinary camera.
 const SIZE: [usize; 2] = [160, 120];
 const FOCAL: f64 = 140.0;
-/// Distance of the cameras from what they look at, scene units.
+/// Distance of the cameras from their target, scene units.
 const RADIUS: f64 = 4.0;
-/// Heights of neighbouring cameras, in turns.
+/// Heights of neighbouring cameras, alternately.
 const HEIGHTS: [f64; 2] = [1.1, 1.9];
-/// What rigs look at.
+/// Target of rigs.
 const TARGET: V3 = [0.0, 0.7, -0.3];
-/// Half the arc of rigs that stand before the scene, and of one that stands all round it, radians.
+/// Half the arc of rigs that are before the scene, and of one that is all round it, radians.
 const HALF_ARC: f64 = 0.9;
 const HALF_RING: f64 = 3.0;
 /// Times of captures in which something moves, and of the rig with many cameras.
@@ -22,7 +20,7 @@ const MOMENTS: usize = 10;
 const FEW_MOMENTS: usize = 5;
 /// Distance of a far background, in distances of the cameras.
 const FAR: f64 = 100.0;
-/// Gains of training cameras, in turns: their product is 1, so that the held-out cameras stand for their mean.
+/// Gains of training cameras, alternately: their product is 1, so that the held-out cameras represent their mean.
 const GAINS: [f64; 4] = [0.65, 1.25, 1.0 / 0.65, 0.8];
 /// Turn of a pose that is wrong: 3°.
 const WRONG: f64 = 3.0 * std::f64::consts::PI / 180.0;
@@ -54,7 +52,7 @@ impl Viewer {
     }
 }
 
-/// A capture before it is drawn.
+/// A capture before it is rendered.
 #[derive(Clone, Debug)]
 pub(crate) struct Scene {
     pub world: World,
@@ -63,7 +61,7 @@ pub(crate) struct Scene {
     pub fps: f64,
     /// Units of the files in units of the world.
     pub units: f64,
-    /// Whether points of moving things belong to the cloud.
+    /// Whether points of moving objects belong to the cloud.
     pub moving_points: bool,
     /// Whether depth and flow of the images to train on are written next to them.
     pub truth: bool,
@@ -113,7 +111,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
         "wrong-pose" => {
             let mut scene = room();
             let camera = scene.viewers.iter_mut().filter(|v| !v.held).nth(WRONG_CAMERA);
-            camera.expect("the rig has so many training cameras").wrong = WRONG;
+            camera.expect("the rig has enough training cameras").wrong = WRONG;
             scene
         }
         "enters" => {
@@ -129,7 +127,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
     Some(scene)
 }
 
-/// Colours of things, dark and light, in turns.
+/// Colours of objects, alternately dark and light.
 const COLORS: [[V3; 2]; 5] = [
     [[0.12, 0.16, 0.28], [0.52, 0.54, 0.46]],
     [[0.30, 0.10, 0.08], [0.60, 0.46, 0.18]],
@@ -208,7 +206,7 @@ fn camera(eye: V3, target: V3) -> Pinhole {
     Pinhole { cam_from_world: Se3::look_at(eye, target, [0.0, 1.0, 0.0]), focal: FOCAL, size: SIZE }
 }
 
-/// Cameras on an arc before the scene, at two heights in turns.
+/// Cameras on an arc before the scene, at two alternating heights.
 fn arc(count: usize, half: f64, held: &[usize]) -> Vec<Viewer> {
     let viewer = |i: usize| {
         let (sin, cos) = sin_cos(half * (2.0 * i as f64 / (count - 1) as f64 - 1.0));
@@ -218,7 +216,7 @@ fn arc(count: usize, half: f64, held: &[usize]) -> Vec<Viewer> {
     (0..count).map(viewer).collect()
 }
 
-/// Twelve cameras side by side, all looking straight ahead; two of the inner ones are held out.
+/// Twelve cameras side by side, all pointing straight ahead; two of the inner ones are held out.
 fn grid() -> Vec<Viewer> {
     let viewer = |i: usize| {
         let (column, row) = ((i % 4) as f64, (i / 4) as f64);
@@ -233,7 +231,7 @@ fn grid() -> Vec<Viewer> {
 fn hand_held(moments: usize) -> Scene {
     let pose = |i: usize| {
         let at = i as f64 / (moments - 1) as f64;
-        // Two sways sideways and three up and down, as a hand has them.
+        // Two sways sideways and three up and down, as of a hand-held camera.
         let turn = |times: f64| sin_cos(std::f64::consts::PI * ((times * at) % 2.0 - 1.0)).0;
         let eye = [1.2 * (2.0 * at - 1.0) + 0.25 * turn(4.0), 1.2 + 0.2 * turn(6.0), 2.6 + 0.2 * turn(2.0)];
         camera(eye, [0.3 * (2.0 * at - 1.0), 0.8 + 0.05 * turn(6.0), -1.0])

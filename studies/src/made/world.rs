@@ -5,9 +5,9 @@
 use splat4d::math::se3::{cross, dot, mat_vec, normalize, sub, transpose};
 use splat4d::math::{Rng, Se3};
 
-/// A place, a direction or a colour.
+/// A position, a direction or a colour.
 pub(crate) type V3 = [f64; 3];
-/// A place in an image, pixels.
+/// A position in an image, pixels.
 pub(crate) type V2 = [f64; 2];
 
 /// Rays a pixel in each direction: their mean is the pixel.
@@ -46,7 +46,7 @@ pub(crate) fn sin_cos(a: f64) -> (f64, f64) {
     (sin, cos)
 }
 
-/// Colours in space: noise of a grain between two colours, a pure function of the seed and the place.
+/// Colours in space: noise of a grain between two colours, a pure function of the seed and the position.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Texture {
     pub seed: u64,
@@ -57,7 +57,7 @@ pub(crate) struct Texture {
 }
 
 impl Texture {
-    /// The colour at a place, sRGB values from 0 to 1.
+    /// The colour at a position, sRGB values from 0 to 1.
     pub(crate) fn at(&self, p: V3) -> V3 {
         let mut sum = [0.0; 4];
         let mut weights = 0.0;
@@ -101,7 +101,7 @@ fn lattice(rng: Rng, p: V3) -> [f64; 4] {
     out
 }
 
-/// The form of a thing, about its own origin.
+/// The shape of an object, about its own origin.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Shape {
     /// Of this radius; seen from inside it is a dome.
@@ -159,17 +159,17 @@ impl Thing {
     }
 }
 
-/// What a ray meets first.
+/// First hit of a ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Seen {
     pub point: V3,
     pub color: V3,
-    /// The thing's number.
+    /// The object's number.
     pub thing: usize,
 }
 
 impl World {
-    /// Where the point of a thing that was seen at a share of the capture is at another one.
+    /// The position of an object's point, seen at a share of the capture, at another one.
     pub(crate) fn later(&self, seen: &Seen, at: f64, then: f64) -> V3 {
         let place = self.things[seen.thing].place;
         add(sub(seen.point, place(at)), place(then))
@@ -183,8 +183,8 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// What a ray (of length 1) from `eye` meets first at a share of the capture.
-    pub(crate) fn look(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
+    /// First hit of a ray (of length 1) from `eye` at a share of the capture.
+    pub(crate) fn cast(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
         let mut first: Option<(f64, V3, usize)> = None;
         for (i, thing) in self.things.iter().enumerate() {
             if let Some((far, normal)) = thing.hit(eye, ray, at).filter(|hit| first.is_none_or(|f| hit.0 < f.0)) {
@@ -216,14 +216,14 @@ impl Pinhole {
         self.cam_from_world.inverse().translation
     }
 
-    /// The direction (of length 1) in which a place in the image lies.
+    /// The direction (of length 1) of an image position.
     pub(crate) fn ray(&self, [x, y]: [f64; 2]) -> V3 {
         let [width, height] = self.size.map(|s| s as f64);
         let own = [(x - 0.5 * width) / self.focal, (y - 0.5 * height) / self.focal, 1.0];
         normalize(mat_vec(&transpose(&self.cam_from_world.rotation), own))
     }
 
-    /// Where a point is in the image; `None`: it is not in it.
+    /// Image position of a point; `None`: outside the image.
     pub(crate) fn project(&self, point: V3) -> Option<[f64; 2]> {
         let p = self.cam_from_world.apply(point);
         let [width, height] = self.size.map(|s| s as f64);
@@ -242,7 +242,7 @@ impl Pinhole {
                 for sample in 0..SAMPLES * SAMPLES {
                     let within = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
                     let place = [x as f64 + within(sample % SAMPLES), y as f64 + within(sample / SAMPLES)];
-                    let color = world.look(eye, self.ray(place), at).map_or([0.0; 3], |s| s.color);
+                    let color = world.cast(eye, self.ray(place), at).map_or([0.0; 3], |s| s.color);
                     sum = add(sum, color);
                 }
                 let mean = times(sum, gain / (SAMPLES * SAMPLES) as f64);
@@ -255,15 +255,15 @@ impl Pinhole {
     /// Depth along the camera's axis at the pixels' centres, world units; 0 where nothing is.
     pub(crate) fn depth(&self, world: &World, at: f64) -> Vec<f64> {
         let eye = self.center();
-        let seen = |ray: V3| world.look(eye, ray, at).map_or(0.0, |s| self.cam_from_world.apply(s.point)[2]);
+        let seen = |ray: V3| world.cast(eye, ray, at).map_or(0.0, |s| self.cam_from_world.apply(s.point)[2]);
         self.pixels().map(|place| seen(self.ray(place))).collect()
     }
 
-    /// Where what the pixels' centres show goes by another time as another camera sees it, pixels; `None`: behind that.
+    /// Displacement of the points at pixel centres to another time and camera, pixels; `None`: behind that.
     pub(crate) fn flow(&self, world: &World, [at, then]: [f64; 2], to: &Self) -> Vec<Option<[f64; 2]>> {
         let eye = self.center();
         let way = |place: V2| {
-            let seen = world.look(eye, self.ray(place), at)?;
+            let seen = world.cast(eye, self.ray(place), at)?;
             let p = to.cam_from_world.apply(world.later(&seen, at, then));
             let arrives = |k: usize| to.focal * p[k] / p[2] + 0.5 * to.size[k] as f64;
             (p[2] > 0.0).then(|| [arrives(0) - place[0], arrives(1) - place[1]])

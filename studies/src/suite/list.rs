@@ -1,5 +1,5 @@
-//! The captures of the suite: a declared list (`studies/suite.toml`, or a file of the user's), found, drawn or copied
-//! before they are trained on.
+//! The captures of the suite: a declared list (`studies/suite.toml`, or a file of the user's), found, rendered or
+//! copied before they are trained on.
 
 use crate::made;
 use serde::Deserialize;
@@ -93,7 +93,7 @@ impl List {
     /// Reads the list of a file, or the one that belongs to the program.
     pub(crate) fn open(file: Option<&Path>) -> Result<Self> {
         let Some(path) = file else {
-            return Ok(Self::parse(DEFAULT).expect("the suite's own list is sound, as its test says"));
+            return Ok(Self::parse(DEFAULT).expect("the suite's own list is valid, as its test checks"));
         };
         Self::parse(&files::read_text(path)?).map_err(|e| e.at(path.display()))
     }
@@ -125,7 +125,7 @@ impl List {
         }
     }
 
-    /// The entries that are asked for, in the list's order. Errors: a name that is not in it.
+    /// The entries that are requested, in the list's order. Errors: a name that is not in it.
     pub(crate) fn only(&self, names: &[String]) -> Result<Vec<&Entry>> {
         if let Some(unknown) = names.iter().find(|n| !self.captures.iter().any(|e| e.name == **n)) {
             let all: Vec<&str> = self.captures.iter().map(|e| e.name.as_str()).collect();
@@ -141,7 +141,7 @@ impl Entry {
     fn check(&self) -> Result<()> {
         let sources = [self.data.is_some(), self.bundled.is_some(), self.made.is_some()];
         if sources.iter().filter(|s| **s).count() != 1 {
-            return Err(Error::input("it must say in one way where it lies")
+            return Err(Error::input("expected exactly one location")
                 .remedy("Give one of data (a folder in those of --data), bundled and made."));
         }
         if let Some(name) = self.made.as_ref().filter(|n| !made::NAMES.iter().any(|m| m.0 == n.as_str())) {
@@ -164,7 +164,7 @@ impl Entry {
         !self.points
     }
 
-    /// The capture's folder: found in `data`, or drawn or copied below `work`. `None`: it is nowhere.
+    /// The capture's folder: found in `data`, or rendered or copied below `work`. `None`: it is nowhere.
     pub(crate) fn folder(&self, data: &[PathBuf], work: &Path) -> anyhow::Result<Option<PathBuf>> {
         let origin = if let Some(folder) = &self.data {
             data.iter().map(|d| d.join(folder)).find(|p| p.is_dir())
@@ -245,8 +245,8 @@ mod tests {
         let parse = |entry: &str| List::parse(&format!("{head}{entry}"));
         assert!(parse("name = \"a\"\ndata = \"a\"").is_ok());
         for (entry, told) in [
-            ("name = \"a\"", "where it lies"),
-            ("name = \"a\"\ndata = \"a\"\nmade = \"enters\"", "where it lies"),
+            ("name = \"a\"", "exactly one location"),
+            ("name = \"a\"\ndata = \"a\"\nmade = \"enters\"", "exactly one location"),
             ("name = \"a\"\nmade = \"leaves\"", "enters"),
             ("name = \"a\"\ndata = \"a\"\nhold_out = \"every=1\"", "every=N"),
             ("name = \"a\"\ndata = \"a\"\ndownscale = { quick = 0, full = 1 }", "reduced by 0"),

@@ -43,10 +43,10 @@ Examples:
   studies suite --data sets -o runs/mcmc --set strategy=mcmc
 
 Steps are fixed (studies/suite.toml), so that results of machines with more or less to do compare. What was found is in
-DIR/results.json (after every capture: the same command goes on where it was stopped) and DIR/suite.md, runs are in
+DIR/results.json (after every capture: the same command continues) and DIR/suite.md, runs are in
 DIR/runs. A cell is measured again when the program, its recipe or its capture's place has changed.";
 
-/// Train the recipe on a list of captures, each in so many steps, and compare
+/// Train the recipe on a list of captures, each in this many steps, and compare
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -68,7 +68,7 @@ pub(crate) struct Args {
     /// Set a setting of every recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Train each for four times the steps too, and say where that costs quality
+    /// Train each for four times the steps too, and report where that costs quality
     #[arg(long)]
     rule: bool,
     /// Bake playback files and compare them with their models, as the full tier does
@@ -79,7 +79,7 @@ pub(crate) struct Args {
     baseline: Option<PathBuf>,
 }
 
-/// What one capture came to in so many steps. Values are dB unless named otherwise.
+/// Result of one capture after this many steps. Values are dB unless named otherwise.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 struct FolderContent {
@@ -90,7 +90,7 @@ struct FolderContent {
     /// Why there are not finite.
     refused: Option<String>,
     motion: String,
-    /// Held-out views: whole images, where things move, and (from these two and the share that moves) elsewhere.
+    /// Held-out views: whole images, dynamic regions, and (from these two and the dynamic share) static ones.
     psnr: Option<f64>,
     /// Whole images after each camera's colour matrix.
     psnr_cc: Option<f64>,
@@ -99,11 +99,11 @@ struct FolderContent {
     ssim: Option<f64>,
     flicker: Option<f64>,
     psnr_train: Option<f64>,
-    /// Training views on the way.
+    /// Training views during the run.
     probes: Vec<Probe>,
     fall: Option<Fall>,
     gaussians: usize,
-    /// Of training, without the looks on the way.
+    /// Of training, without the evaluations during the run.
     seconds: f64,
     /// The playback file against its model.
     playback_psnr: Option<f64>,
@@ -142,7 +142,7 @@ struct Order<'a> {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is said before anything takes time.
+    // Impossible settings are reported before any work.
     let list = List::open(args.list.as_deref())?;
     let entries = list.only(&args.only)?;
     let baseline = args.baseline.as_deref().map(Results::read).transpose()?;
@@ -182,13 +182,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let page = args.output.join("suite.md");
     files::write(&page, text.as_bytes())?;
-    console.say(text.trim_end());
+    console.print_line(text.trim_end());
     console.written(&page);
     console.emit(&json!({"type": "done", "study": file}));
     Ok(())
 }
 
-/// Where the rule is broken.
+/// Violations of the rule.
 fn judged(cells: &[FolderContent]) -> String {
     let longer = |s: &FolderContent| cells.iter().find(|l| l.capture == s.capture && l.steps == s.steps * MORE);
     let broken: Vec<String> = cells.iter().filter_map(|s| longer(s).map(|l| broken(s, l))).flatten().collect();
@@ -198,7 +198,7 @@ fn judged(cells: &[FolderContent]) -> String {
     }
 }
 
-/// Every cell of the captures that are there; of others it is said that they are not.
+/// Every cell of the captures that are there; of others it is reported that they are not.
 fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console) -> anyhow::Result<Vec<Order<'a>>> {
     let own = std::env::current_exe().context("this program does not know where it lies")?;
     let program = files::fingerprint(std::fs::read(&own).map_err(|e| files::cannot_read(&own, e))?);
@@ -214,7 +214,7 @@ fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console
             let mut recipe = recipe.clone();
             recipe.run.iterations *= more;
             if recipe.run.checkpoint_interval == 0 {
-                // A checkpoint is a look at the training views.
+                // Training views are evaluated at every checkpoint.
                 recipe.run.checkpoint_interval = (recipe.run.iterations / PROBES).max(1);
             }
             let told = [program.as_str(), &folder.display().to_string(), &recipe.flat_toml()].join("\n");
@@ -224,7 +224,7 @@ fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console
     Ok(orders)
 }
 
-/// The recipe of a capture: the default one, with what the list and the user say.
+/// The recipe of a capture: the default one, with settings of the list and the user.
 fn recipe(entry: &Entry, steps: usize, args: &Args) -> Result<Recipe> {
     let mut recipe = Recipe::default();
     recipe.set("run.motion=auto")?;
@@ -258,13 +258,13 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
     let interrupted = |e: &Error| e.kind() == ErrorKind::Interrupted;
     let mut found = match found {
         Err(error) if !interrupted(&error) => return Ok(FolderContent { refused: Some(error.to_string()), ..blank }),
-        found => found.map_err(|e| e.at(args.output.display()).remedy("The same command goes on with it."))?,
+        found => found.map_err(|e| e.at(args.output.display()).remedy("Run the same command again to continue."))?,
     };
     if args.playback || args.tier == Tier::Full {
         evaluating::playback(&run, console)?;
         found.playback_psnr = Run::open(&run)?.number("playback_psnr");
     }
-    // The scene stays, to look at; checkpoints are three times its size.
+    // The scene is kept for inspection; checkpoints are three times its size.
     checkpoint::list(&run).iter().try_for_each(std::fs::remove_file).map_err(|e| files::cannot_write(&run, e))?;
     Ok(found)
 }
@@ -337,12 +337,11 @@ fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Opt
     (rest > 0.0 && rest.is_finite()).then(|| -10.0 * rest.log10())
 }
 
-/// What a run is measured on, opened when it has begun: points that it found in its images say from how near its
+/// The views that a run is measured on, opened after its start: points found in its images set the near plane of its
 /// cameras see.
 struct Judges {
     whole: Judge,
-    /// The same at half the size. While images of half the size are trained on, they are what training views are: at
-    /// full
+    /// The same at half the size. While images of half the size are trained on, they are the training views: at full
     /// size a scene that has never seen one gets worse and better at random.
     coarse: Judge,
 }

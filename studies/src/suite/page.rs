@@ -1,4 +1,4 @@
-//! What the suite found, as a Markdown table.
+//! Results of the suite, as a Markdown table.
 
 use super::FolderContent;
 use splat4d_workflow::files::grouped;

@@ -1,17 +1,17 @@
 //! The rule that a recipe must keep on every capture: more steps do not cost quality, and training views do not get
-//! worse on the way.
+//! worse during the run.
 
 use super::FolderContent;
 use serde::{Deserialize, Serialize};
 
 /// Times as many steps as the shorter run.
 pub(crate) const MORE: usize = 4;
-/// What the longer run may lose on held-out views, dB: about what two seeds differ by.
+/// Largest loss of the longer run on held-out views, dB: about what two seeds differ by.
 const LOSS: f64 = 0.1;
-/// What training views may lose on the way, dB.
+/// Largest loss of training views during the run, dB.
 const FALL: f64 = 1.0;
 
-/// Training views after so many steps.
+/// Training views after this many steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Probe {
     pub step: usize,
@@ -19,7 +19,7 @@ pub(crate) struct Probe {
     pub psnr: f64,
 }
 
-/// The largest loss of training views on the way.
+/// The largest loss of training views during the run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Fall {
     pub db: f64,
@@ -47,7 +47,7 @@ pub(crate) fn largest_fall(probes: &[Probe], change: usize) -> Option<Fall> {
     worst
 }
 
-/// What a capture's runs break, a sentence each.
+/// Violations of a capture's runs, a sentence each.
 pub(crate) fn broken(short: &FolderContent, long: &FolderContent) -> Vec<String> {
     let mut out = Vec::new();
     if let (Some(before), Some(after)) = (short.psnr, long.psnr)

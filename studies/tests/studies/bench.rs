@@ -83,7 +83,7 @@ fn scenes_that_are_not_there_are_skipped() {
 }
 
 #[test]
-fn what_cannot_be_measured_is_refused_at_once() {
+fn invalid_measurements_are_refused_at_once() {
     let work = tempfile::tempdir().unwrap();
     let file = |name: &str, bytes: &[u8]| -> PathBuf {
         let path = work.path().join(name);

@@ -21,7 +21,7 @@ pub(super) enum Disturbance {
     Full,
     /// The same command a second time at once.
     TwoOwners,
-    /// A kill, and clocks that jump a day forth or back; or that jump under a process that lives.
+    /// A kill, and clocks that jump a day forth or back; or that jump while a process runs.
     Clock,
     /// The folder becomes read-only at a random time.
     ReadOnly,
@@ -61,7 +61,7 @@ pub(super) fn disturb(
             let ended = program.run(words, place, Some(kilobytes))?;
             check_said(&ended)?;
             ensure!(ended.code != Some(2), "a full disk is not the user's fault: {}", ended.said);
-            if ended.code == Some(0) { "it fitted".into() } else { "refused for want of space".into() }
+            if ended.code == Some(0) { "it fitted".into() } else { "refused for lack of space".into() }
         }
         Disturbance::TwoOwners => {
             let mut first = program.start(words, place, None)?;
@@ -103,7 +103,7 @@ pub(super) fn disturb(
             check_said(&ended)?;
             drop(guard);
             ensure!(ended.code != Some(2), "a read-only folder is not the user's fault: {}", ended.said);
-            if ended.code == Some(0) { "it was done before".into() } else { "refused for want of rights".into() }
+            if ended.code == Some(0) { "it was done before".into() } else { "refused for lack of rights".into() }
         }
     })
 }
@@ -127,8 +127,8 @@ fn set_times(place: &Path, at: SystemTime) {
     }
 }
 
-/// A folder that is read-only for so long. Of root, who may write anywhere, the folders become immutable where the file system
-/// knows that; else nothing happens to it.
+/// A folder that is read-only for so long. Of root, who may write anywhere, the folders become immutable where the file
+/// system handles that; else it is not disturbed.
 struct ReadOnly(Vec<(PathBuf, Permissions)>, bool);
 
 impl ReadOnly {

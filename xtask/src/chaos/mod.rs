@@ -153,7 +153,7 @@ impl Bench<'_> {
         let undisturbed = &self.undisturbed[verb.name];
         let words = (verb.words)(self.setup, &place);
         let how = disturb::disturb(kind, &self.setup.program, &words, &place, undisturbed, random)?;
-        // Whatever came to pass, the same command ends as if nothing had, or has ended so already.
+        // After any disturbance the same command ends like an undisturbed one, or has already ended so.
         let last = self.setup.program.run(&words, &place, None)?;
         check_said(&last)?;
         let found = result(&place)?;
@@ -174,7 +174,7 @@ impl Bench<'_> {
     }
 }
 
-/// Refusals say why, and nothing panics, hangs or is ended by the system.
+/// Refusals state the reason, and nothing panics, hangs or is ended by the system.
 pub(super) fn check_said(ended: &Ending) -> Result<()> {
     ensure!(!ended.said.contains("panicked"), "it panics: {}", ended.said);
     match ended.code {
@@ -184,7 +184,7 @@ pub(super) fn check_said(ended: &Ending) -> Result<()> {
     }
 }
 
-/// What a trial compares: the files of the output, volatile ones by name alone.
+/// Compared output of a trial: the files of the output, volatile ones by name alone.
 fn result(place: &Path) -> Result<BTreeMap<PathBuf, Option<Vec<u8>>>> {
     let all = tree(place)?.into_iter().filter(|(path, _)| {
         let out = path.starts_with("out") || path.file_stem().is_some_and(|s| s == "out");

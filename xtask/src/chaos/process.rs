@@ -7,26 +7,26 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Processor time from which a call hangs: undisturbed ones take below two seconds (studies/records/2026-11-27-reliability.md). Time
-/// on the clock states nothing on a machine that is shared.
+/// Processor time from which a call hangs: undisturbed ones take below two seconds
+/// (studies/records/2026-11-27-reliability.md). Time on the clock states nothing on a machine that is shared.
 const BUSY: f64 = 60.0;
 /// A call that waits so long without using a processor hangs.
 const IDLE: Duration = Duration::from_secs(60);
-/// Where the system does not say how much processor time a process has used, a call hangs after this time.
+/// Time after which a call counts as hanging if the system does not report processor time.
 const HANGS: Duration = Duration::from_secs(120);
 /// Time between two readings of the processor time.
 const READING: Duration = Duration::from_millis(500);
 /// Ticks a second in which Linux counts processor time, on all of its architectures.
 const TICKS: f64 = 100.0;
-/// Time between two looks whether a call has ended.
-const LOOK: Duration = Duration::from_millis(2);
+/// Time between two checks whether a call has ended.
+const POLL: Duration = Duration::from_millis(2);
 /// Threads of a call: the machine may be shared.
 const THREADS: &str = "2";
 
 /// How a call ended.
 pub(crate) struct Ending {
     pub(crate) code: Option<i32>,
-    /// What it said on stderr.
+    /// Its stderr.
     pub(crate) said: String,
 }
 
@@ -53,7 +53,7 @@ impl Program {
     /// Starts a call.
     pub(crate) fn start(&self, words: &[OsString], place: &Path, limit: Option<u64>) -> Result<Call> {
         let mut child = self.command(words, place, limit).spawn().context("the program cannot be started")?;
-        let mut pipe = child.stderr.take().expect("it was asked for");
+        let mut pipe = child.stderr.take().expect("it was requested");
         let said = std::thread::spawn(move || {
             let mut bytes = Vec::new();
             let _ = pipe.read_to_end(&mut bytes);
@@ -68,7 +68,7 @@ impl Program {
     }
 }
 
-/// A call under way.
+/// A running call.
 pub(crate) struct Call {
     child: Child,
     said: Option<std::thread::JoinHandle<String>>,
@@ -76,19 +76,19 @@ pub(crate) struct Call {
 }
 
 impl Call {
-    /// Waits so long, or until it ends. Returns whether it is still under way.
+    /// Waits so long, or until it ends. Returns whether it is still running.
     pub(crate) fn wait(&mut self, time: Duration) -> Result<bool> {
         let began = Instant::now();
         while began.elapsed() < time {
             if self.child.try_wait()?.is_some() {
                 return Ok(false);
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL);
         }
         Ok(self.child.try_wait()?.is_none())
     }
 
-    /// Processor time of the process and of those that it waited for, seconds; `None`: the system does not say.
+    /// Processor time of the process and of those that it waited for, seconds; `None`: the system does not report it.
     fn seconds(&self) -> Option<f64> {
         processor_time(&std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).ok()?)
     }
@@ -134,7 +134,7 @@ fn processor_time(stat: &str) -> Option<f64> {
     Some(ticks?.iter().sum::<f64>() / TICKS)
 }
 
-/// A folder of this process that goes at the end.
+/// A folder of this process that is deleted at the end.
 pub(crate) struct Scratch(PathBuf);
 
 impl Scratch {

@@ -1,4 +1,4 @@
-//! A tiny capture: four cameras on an arc look at a bright square that crosses a grey wall.
+//! A tiny capture: four cameras on an arc film a bright square that crosses a grey wall.
 
 use crate::files::{png, write_file};
 use anyhow::Result;
@@ -14,7 +14,7 @@ const DISTANCE: f64 = 3.0;
 /// Angle between neighbouring cameras, radians.
 const APART: f64 = 0.35;
 
-/// Writes it, of so many frames a camera, with masks of labels.
+/// Writes it, of this many frames per camera, with masks of labels.
 pub(super) fn write(folder: &Path, frames: usize) -> Result<()> {
     let cameras: Vec<Value> = (0..CAMERAS).map(|c| camera(folder, c, frames)).collect::<Result<_>>()?;
     let labels = json!(["wall", "square"]);
@@ -25,7 +25,7 @@ pub(super) fn write(folder: &Path, frames: usize) -> Result<()> {
 fn camera(folder: &Path, number: usize, frames: usize) -> Result<Value> {
     let angle = APART * (number as f64 - 1.5);
     let (sin, cos) = angle.sin_cos();
-    // It stands at (d sin, 0, -d cos), and looks at the origin; y points down.
+    // It is at (d sin, 0, -d cos), and points at the origin; y points down.
     let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
     for frame in 0..frames {
         let (mut color, mut label) = (Vec::new(), Vec::new());

@@ -24,7 +24,7 @@ pub(super) struct Verb {
     pub(super) words: fn(&Setup, &Path) -> Vec<OsString>,
 }
 
-/// What all trials read.
+/// Shared inputs of all trials.
 pub(super) struct Setup {
     pub(super) program: Program,
     capture: PathBuf,
@@ -73,7 +73,7 @@ impl Setup {
     }
 }
 
-/// Words of a text; `{}` are these paths in turn.
+/// Words of a text; `{}` are replaced by these paths in order.
 fn words(text: &str, paths: &[&Path]) -> Vec<OsString> {
     let mut paths = paths.iter();
     let word = |w: &str| match w {

@@ -15,8 +15,8 @@ const ORDER: [(&str, &[&str]); 9] = [
     ),
     (
         "crates/splat4d-train",
-        // Every part is built from its own settings and facts of the capture; `recipe` composes the settings and builds the
-        // parts, so that only what runs a whole training imports it.
+        // Every part is built from its own settings and facts of the capture; `recipe` composes the settings and builds
+        // the parts, so that only what runs a whole training imports it.
         &[
             "settings",
             "event",
@@ -177,13 +177,14 @@ const ORDER: [(&str, &[&str]); 9] = [
     ),
 ];
 
-/// Modules that a module must not import although they stand before it: the design's first invariant.
+/// Modules that a module must not import although they are before it: the design's first invariant.
 const NEVER: [(&str, &str, &[&str]); 1] = [
-    // The renderer knows no time: it sees splats, not the models and layers that make them.
+    // The renderer does not depend on time: it gets splats, not the models and layers that make them.
     ("crates/splat4d", "render", &["motion", "layers"]),
 ];
 
-/// Words of a source without comments, literals and items that only tests have; `::` is one word, other signs are one each.
+/// Words of a source without comments, literals and items that only tests have; `::` is one word, other signs are one
+/// each.
 fn words(text: &str) -> Vec<String> {
     let chars: Vec<char> = text.chars().collect();
     let at = |i: usize| chars.get(i).copied().unwrap_or('\0');
@@ -258,10 +259,11 @@ fn without_tests(words: &[String]) -> Vec<String> {
     out
 }
 
-/// A path that is named, and the name by which the file knows it.
+/// A path that is named, and its name in the file.
 type Named = (Vec<String>, String);
 
-/// Paths of a tree of imports, from its words on: `a::{b, c as d}` gives a::b and a::c. Returns the words that it takes.
+/// Paths of a tree of imports, from its words on: `a::{b, c as d}` gives a::b and a::c. Returns the words that it
+/// takes.
 fn tree(words: &[String], prefix: &[String], out: &mut Vec<Named>) -> usize {
     let (mut path, mut i) = (prefix.to_vec(), 0);
     let mut alias = None;
@@ -383,8 +385,8 @@ impl Crate {
         self.paths.contains_key(&at).then_some(at)
     }
 
-    /// Which files each file imports. A module may use what the modules around it hold: those are not counted, nor is the
-    /// crate's own file.
+    /// Which files each file imports. A module may use what the modules around it hold: those are not counted, nor is
+    /// the crate's own file.
     fn edges(&self) -> BTreeMap<Module, BTreeSet<Module>> {
         let mut out = BTreeMap::new();
         for (module, imports) in &self.imports {

@@ -2,9 +2,9 @@
 
 use super::{code, files, is_test, is_word, read, report};
 
-/// Public items of a crate at most: lines of its sources, tests aside, that begin a `pub` function, method, type, trait or
-/// constant. `unreachable_pub` sees to it that such a line can be reached. A lower count lowers the limit; the goals are 600 for
-/// `splat4d` and 250 for `splat4d-train`.
+/// Public items of a crate at most: lines of its sources, tests aside, that begin a `pub` function, method, type, trait
+/// or constant. `unreachable_pub` ensures that such a line can be reached. A lower count lowers the limit; the goals
+/// are 600 for `splat4d` and 250 for `splat4d-train`.
 const PUBLIC: [(&str, usize); 3] =
     [("crates/splat4d/src", 863), ("crates/splat4d-train/src", 469), ("crates/splat4d-import/src", 94)];
 /// A count this far below its limit is a limit to be lowered.
@@ -51,8 +51,8 @@ fn libraries_show_no_more_than_they_did() {
     report(troubles, "The limits only shrink.");
 }
 
-/// An addition of each kind that stands in the code, by words that it alone brought, and the files that it may touch. Tests,
-/// documents and the list of the fuzzer aside.
+/// An addition of each kind that is in the code, by words that it alone brought, and the files that it may touch.
+/// Tests, documents and the list of the fuzzer aside.
 const ADDITIONS: [(&str, &[&str], &[&str]); 4] = [
     (
         "motion model",

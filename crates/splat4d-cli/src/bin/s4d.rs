@@ -1,6 +1,7 @@
 //! `s4d`: the command under a second name, for systems where another package installs a command `splat4d`.
 //!
-//! It starts the `splat4d` in its own folder: a second copy of the program would double the archives and the time to link.
+//! It starts the `splat4d` in its own folder: a second copy of the program would double the archives and the time to
+//! link.
 
 use std::process::{Command, ExitCode};
 
@@ -32,7 +33,7 @@ fn run(command: &mut Command) -> std::io::Result<ExitCode> {
     Err(std::os::unix::process::CommandExt::exec(command))
 }
 
-/// Waits for the command, which alone answers Ctrl-C.
+/// Waits for the command, which alone handles Ctrl-C.
 #[cfg(not(unix))]
 fn run(command: &mut Command) -> std::io::Result<ExitCode> {
     let _ = ctrlc::set_handler(|| {});

@@ -30,7 +30,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 fn completed() -> clap::Command {
     let settings = Recipe::settings();
     let models = settings.iter().find(|k| k.key() == "run.motion").map(|k| k.choices.clone()).unwrap_or_default();
-    // Words of a command live as long as the program.
+    // Words of a command need a static lifetime.
     let settings: Vec<&'static str> = settings.iter().map(|k| &*format!("{}=", k.key()).leak()).collect();
     let with_settings =
         |verb: clap::Command| verb.mut_arg("set", |a| a.value_parser(PossibleValuesParser::new(settings.clone())));

@@ -82,7 +82,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     let work = match &args.resume {
         Some(dir) => Work::reopen(dir)?,
-        None => Work::begin(args.run.as_ref().expect("clap asks for a run"), &options(args), console)?,
+        None => Work::begin(args.run.as_ref().expect("clap requires a run"), &options(args), console)?,
     };
     let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "training", console));
     let stop = interrupt::flag("stopping");

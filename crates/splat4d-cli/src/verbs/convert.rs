@@ -21,7 +21,7 @@ Examples:
   splat4d convert runs/field field.ply --world        positions in the capture's map
   splat4d convert lengths.ply scene.ply --linear scales --linear opacities";
 
-/// What stands under the help: examples, and the formats of the list.
+/// Text below the help: examples, and the formats of the list.
 fn after_help() -> String {
     let read = DIALECTS.iter().filter(|d| !d.is_written()).map(|d| format!("{} ({})", d.name, d.ending));
     format!(

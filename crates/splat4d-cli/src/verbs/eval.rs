@@ -1,4 +1,4 @@
-//! `eval`: measures a run again, perhaps next to a scene that stands still.
+//! `eval`: measures a run again, perhaps next to a scene that is static.
 
 use crate::console::Console;
 use crate::device::Device;
@@ -126,7 +126,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag("stopping");
     interrupt::stop_not_polled("the same command begins again");
     let measure = Measure { device: chosen(args.device.into(), "measuring", console), ..args.measure.options() };
-    let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
+    let path = args.run.as_ref().or(args.model.as_ref()).expect("clap requires a run");
     if let Some(capture) = &args.capture {
         let options = ForeignOptions {
             hold_out: args.hold_out.clone(),

@@ -1,5 +1,5 @@
-//! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
-//! Gaussians, or points that are asked for, go as JSON or CSV.
+//! `export`: times of a scene as plain 3DGS .ply files, the whole as one page with its player, or the positions of its
+//! Gaussians or of requested points as JSON or CSV.
 
 use crate::console::Console;
 use serde_json::json;
@@ -98,7 +98,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap asks for a source");
+    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap requires a source");
     for (name, value) in [("--time", args.time), ("--fps", args.fps), ("--from", args.from), ("--to", args.to)] {
         if value.is_some_and(|v| !v.is_finite() || (name == "--fps" && !(0.01..=1000.0).contains(&v))) {
             return Err(Error::input(format!("{name} is out of range"))
@@ -123,7 +123,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .remedy("First write a file with that label only: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
-        let out = args.output.as_ref().expect("clap asks for an output");
+        let out = args.output.as_ref().expect("clap requires an output");
         return Ok(exporting::page(path, out, args.link.as_deref(), console)?);
     }
     if args.link.is_some() {
@@ -146,7 +146,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
         return Ok(());
     }
-    let out = args.output.as_ref().expect("clap asks for an output");
+    let out = args.output.as_ref().expect("clap requires an output");
     if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) && !out.starts_with("/dev") {
         return Err(Error::input("a time of the scene is written as .ply, and a page as .html")
             .at(out.display())
@@ -156,7 +156,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let time = args.time.unwrap_or(scene.clip[0]);
     let n = exporting::moment(scene, time, args.world, out)?;
     exporting::warn_of_empty(scene, time, n, console);
-    console.say(&format!("{} Gaussians at {time} s", files::grouped(n)));
+    console.print_line(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
     console.written(out);
     Ok(())

@@ -159,7 +159,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         console.result(&imported.in_words());
     }
     if imported.report.cameras.len() > 1 && args.rig != "moving" {
-        console.say("all cameras train; to measure new views, hold one out: --hold-out camera=NAME");
+        console.print_line("all cameras train; to measure new views, hold one out: --hold-out camera=NAME");
     }
     console.next("train", &args.output);
     Ok(())

@@ -1,4 +1,4 @@
-//! `predict`: how a run that saw a part of its take goes on, compared with the part that it did not see.
+//! `predict`: how a run that saw a part of its take continues, compared with the part that it did not see.
 
 use crate::console::Console;
 use crate::interrupt;
@@ -26,7 +26,7 @@ koopman (decaying oscillations), causal (state space), graph (messages along edg
 predict.json, dynamics.safetensors and the predicted scene as scene.s4d and scene.safetensors. With several models, the \
 scene uses the one with the best forecasts within the observed part.";
 
-/// Largest horizon, frames: a minute at 60 frames a second.
+/// Largest horizon, frames: a minute at 60 frames per second.
 const MAX_HORIZON: usize = 3600;
 /// Most members of an ensemble.
 const MAX_SEEDS: u64 = 16;

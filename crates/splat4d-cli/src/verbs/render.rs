@@ -111,7 +111,7 @@ fn channels() -> impl TypedValueParser<Value = Channel> {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap asks for a source");
+    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap requires a source");
     let options = RenderOptions {
         output: args.output.clone(),
         path: args.path.clone(),

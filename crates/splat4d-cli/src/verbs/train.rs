@@ -15,9 +15,9 @@ use splat4d_workflow::files::{self, parse_bytes};
 use splat4d_workflow::training::{self, Finish, TrainingOptions};
 use std::path::PathBuf;
 
-/// What a run's lock names as its owner while it is continued.
+/// Owner named by a run's lock while it is continued.
 const RESUME: &str = "train --resume";
-/// What the first Ctrl-C is answered with in training.
+/// Message for the first Ctrl-C in training.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 
 const EXAMPLES: &str = "\
@@ -171,7 +171,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag(SAVING);
     let control = Control::new(stop.clone());
     args.measure.check()?;
-    if !args.view && args.place.is_told() {
+    if !args.view && args.place.is_printed() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
     let watched = Watched::new(args.view.then_some(&args.place), &control, console);
@@ -193,7 +193,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             training::resume(run, &options, &stop, &watched)?
         }
         None => {
-            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
+            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap requires a capture");
             let recipe = recipe(args)?;
             let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
             recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
@@ -217,7 +217,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if trained.iteration.is_some() && watched.is_on() && console.terminal() {
-        console.say("the player keeps running until Ctrl-C");
+        console.print_line("the player keeps running until Ctrl-C");
         interrupt::stop_polled("stopping");
         serving::wait(&stop);
     }
@@ -227,7 +227,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 /// The recipe file, then the quality, then the options, then every --set.
 fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = match &args.recipe {
-        // What the capture is, is seen better than guessed: the library's default is one model.
+        // The model is chosen by the capture; the library's default is one model.
         None => Recipe::default().with(|r| r.run.motion = MotionName::AUTO),
         Some(path) => {
             // An empty one, or one of the kernel that claims to be, would be the defaults without a word.
@@ -241,7 +241,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let typed = |name: &str| {
         args.set.iter().any(|a| a.split_once('=').is_some_and(|(key, _)| Recipe::key_of(key.trim()) == name))
     };
-    // Another length than the file's is gone through in its own way.
+    // A length other than the file's gets its own schedule.
     if (args.iterations.is_some() || typed("run.iterations")) && args.quality.is_none() {
         recipe = recipe.unresolved();
     }
@@ -333,7 +333,7 @@ mod tests {
         args: Args,
     }
 
-    /// What the recipe becomes with these words.
+    /// The recipe after these arguments.
     fn typed(words: &[&str]) -> Recipe {
         recipe(&Typed::parse_from([&["train", "take"], words].concat()).args).unwrap()
     }

@@ -74,18 +74,18 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let stop = interrupt::flag("stopping");
     let running = serving::start_for(config, &args.place, token.as_deref(), console)?;
-    console.say("Ctrl-C stops it");
+    console.print_line("Ctrl-C stops it");
     serving::wait(&stop);
     running.stop();
     Ok(())
 }
 
-/// The capture at a path, if that is one: a marker file, or a folder that is no run.
+/// The capture at a path, if that is one: a marker file, or a folder that is not a run.
 fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
     if is_metadata(path) {
         return open_capture(path, &Recipe::default()).map(Some);
     }
-    // What is wrong with a folder that is neither is said by the reader of scenes.
+    // The reader of scenes reports what is wrong with a folder that is neither.
     Ok(if path.is_dir() && !Run::is(path) { open_capture(path, &Recipe::default()).ok() } else { None })
 }
 
@@ -93,7 +93,7 @@ fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
 fn of_capture(capture: Capture, console: &Console) -> anyhow::Result<Config> {
     let capture = Arc::new(capture);
     if capture.points.is_none() {
-        console.say("the capture has no points: the page shows its cameras and images");
+        console.print_line("the capture has no points: the page shows its cameras and images");
     }
     let title = capture.name.clone();
     let source = Source::own(capture_page::points(&capture));

@@ -1,4 +1,4 @@
-//! What goes out next to colours: channels as images and numbers, points that are asked for, labels.
+//! Exports next to colours: channels as images and numbers, requested points, labels.
 
 use crate::convert::moving;
 use crate::sample::{Capture, splat4d};

@@ -1,6 +1,6 @@
 //! A take in chunks, from the command line: part by part and joined, and what is refused.
 
-use crate::sample::{Answer, Capture, splat4d};
+use crate::sample::{Capture, Output, splat4d};
 use crate::{TINY, json_of, str};
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ fn take(work: &Path) -> PathBuf {
     sample.write()
 }
 
-fn train(capture: &Path, run: &Path, more: &[&str]) -> Answer {
+fn train(capture: &Path, run: &Path, more: &[&str]) -> Output {
     splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).args(&CHUNKS).args(more).run()
 }
 
@@ -43,7 +43,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         ("1", ["done", "done", "done"]),
     ] {
         train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
-        // It plays as far as it goes, and an older reader refuses it by its version.
+        // Its present part plays, and an older reader refuses it by its version.
         let bytes = std::fs::read(&film).unwrap();
         assert_eq!(bytes[8..12], [2, 0, 0, 0], "{part}");
         let told = splat4d(&["info", str(&film), "--json"]).run().ok();
@@ -78,7 +78,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     assert!(said.contains("finished, 3 parts joined") && !said.contains(" of 20"), "{said}");
     assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());
     assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker at chunk boundaries"));
-    // A run like any other: all of it is done, and it is measured and drawn.
+    // A run like any other: all of it is done, and it is measured and rendered.
     splat4d(&["train", "--resume", str(&one), "--no-eval"]).run().ok();
     splat4d(&["eval", str(&parts)]).run().ok();
     splat4d(&["export", str(&parts.join("chunks/00")), "-o", str(&work.path().join("now.ply")), "--time=0"]).run().ok();

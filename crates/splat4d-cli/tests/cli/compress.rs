@@ -5,7 +5,7 @@ use crate::{json_of, str, train};
 use serde_json::Value;
 
 #[test]
-fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
+fn a_run_is_compressed_and_measured_before_and_after() {
     let work = tempfile::tempdir().unwrap();
     let run = work.path().join("run");
     train(&Capture::new(work.path()).write(), &run).ok();
@@ -29,7 +29,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     let spent: u64 = told["stages"].as_array().unwrap().iter().map(|s| s["steps"].as_u64().unwrap()).sum();
     assert_eq!(spent, 8, "as many steps as were asked for");
 
-    // What was measured is the file: its scene scores as the folder's.
+    // The scores are those of the file: its scene equals the folder's.
     let scores = json_of(&dir.join("results.json"));
     assert_eq!(scores["ours_8"]["PSNR"], told["after"]["psnr"]);
     let scene = splat4d::format::scene::read(&std::fs::read(dir.join("scene.safetensors")).unwrap()).unwrap();
@@ -74,7 +74,7 @@ fn a_size_is_kept_or_refused_with_the_smallest_that_is_possible() {
     };
     let least = compress("0.001", "none").refused();
     assert!(least.contains("Give --max-mb at least"), "{least}");
-    // What it names is enough.
+    // The named files suffice.
     let named = least.split("at least ").nth(1).unwrap().trim_end().trim_end_matches('.').to_owned();
     compress(&named, "least").ok();
     let bytes = std::fs::metadata(work.path().join("least/scene.s4d")).unwrap().len();

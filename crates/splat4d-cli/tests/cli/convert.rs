@@ -1,4 +1,4 @@
-//! Files go between the formats of other programs, and what is lost is said.
+//! Conversion between formats of other programs, with reports of lost data.
 
 use crate::sample::{shown, splat4d};
 use splat4d::format::{Dialect, ply, scene, splatv};
@@ -66,7 +66,7 @@ fn a_dynamic_scene_converts_to_every_format() {
         splat4d(&["convert", from, to, "--json"]).args(more).run_in(work.path()).ok()
     };
 
-    // Moving targets keep the motion, turned to their axes; single times say which one was taken.
+    // Moving targets keep the motion, turned to their axes; single times report the chosen one.
     for (name, dialect) in [("birds.splatv", splatv::DIALECT), ("birds.stg.ply", ply::STG)] {
         let said = convert("birds.safetensors", name, &[]);
         assert!(said.contains("view dependence"), "{said}");
@@ -144,7 +144,7 @@ fn a_scene_with_a_head_renders_and_does_not_convert() {
         let refused = run(args).refused();
         assert!(refused.contains("features=none"), "{args:?}: {refused}");
     }
-    // Where Gaussians go has nothing to do with colours.
+    // Paths do not depend on colours.
     run(&["export", "full.safetensors", "--tracks", "a.csv"]).ok();
 }
 

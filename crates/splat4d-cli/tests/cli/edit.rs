@@ -13,7 +13,7 @@ fn write(path: &Path, title: &str) {
 }
 
 /// A call that works and states all of this.
-fn says(call: Call, words: &[&str]) {
+fn output_contains(call: Call, words: &[&str]) {
     let told = call.run().all();
     words.iter().for_each(|word| assert!(told.contains(word), "{word} is not in {told}"));
 }
@@ -46,27 +46,27 @@ fn a_list_and_options_make_a_new_file() {
         .run()
         .refused();
     assert!(!at("both.safetensors").exists() && !at("again.toml").exists());
-    says(of(&[&birds, &edits, "--save", &again, "-o", &both]), &["80 Gaussians of 40", "2 layers"]);
+    output_contains(of(&[&birds, &edits, "--save", &again, "-o", &both]), &["80 Gaussians of 40", "2 layers"]);
     let made = scene::read(&std::fs::read(&both).unwrap()).unwrap();
     let names: Vec<&str> = made.layers.iter().map(|l| l.name.as_str()).collect();
     assert_eq!(names, ["birds", "b/others"]);
     // The saved list makes the same bits.
     let first = std::fs::read(&both).unwrap();
-    says(of(&[&birds, &again, "-o", &both]), &["80 Gaussians"]);
+    output_contains(of(&[&birds, &again, "-o", &both]), &["80 Gaussians"]);
     assert_eq!(std::fs::read(&both).unwrap(), first);
-    says(of(&[&both, "--layer", "b/others", "-o", &name("b.stg.ply")]), &["40 Gaussians of 80"]);
-    says(of(&[&birds, "--count", "all"]), &["40 of 40", "0.000 s", "1.000 s"]);
-    // Provenance goes along, and away.
-    says(of(&[&birds, &edits, "--note", "birds that agreed", "-o", &file]), &["primitives"]);
-    says(splat4d(&["info", &file]), &["made with", "merge, recolor", "birds that agreed"]);
+    output_contains(of(&[&both, "--layer", "b/others", "-o", &name("b.stg.ply")]), &["40 Gaussians of 80"]);
+    output_contains(of(&[&birds, "--count", "all"]), &["40 of 40", "0.000 s", "1.000 s"]);
+    // Provenance is copied, and removed on request.
+    output_contains(of(&[&birds, &edits, "--note", "birds that agreed", "-o", &file]), &["primitives"]);
+    output_contains(splat4d(&["info", &file]), &["made with", "merge, recolor", "birds that agreed"]);
     let kept = name("kept.s4d");
     splat4d(&["convert", &file, &kept]).run().ok();
     let told = playback::provenance(&std::fs::read(&kept).unwrap()).unwrap().unwrap();
     assert_eq!((told.edits.len(), told.words.as_deref()), (2, Some("birds that agreed")));
     splat4d(&["convert", &file, &kept, "--no-provenance"]).run().ok();
     assert_eq!(playback::provenance(&std::fs::read(&kept).unwrap()).unwrap(), None);
-    // A playback file edited again keeps what it was, but for what was asked.
-    says(of(&[&file, "--delete", "sphere(9,0,0, 1)", "-o", &kept]), &["delete"]);
+    // A playback file edited again keeps its content, except for the requested change.
+    output_contains(of(&[&file, "--delete", "sphere(9,0,0, 1)", "-o", &kept]), &["delete"]);
     let told = playback::provenance(&std::fs::read(&kept).unwrap()).unwrap().unwrap();
     assert_eq!(told.edits.len(), 3);
 }

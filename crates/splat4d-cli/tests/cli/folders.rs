@@ -1,4 +1,4 @@
-//! Output folders, as a user meets them; what is behind them is tested where it is (`splat4d_train::output`).
+//! Output folders from a user's view; their implementation is tested in `splat4d_train::output`.
 
 use crate::sample::{Capture, splat4d};
 use crate::{TINY, str};
@@ -30,7 +30,7 @@ fn count(folder: &Path) -> usize {
 fn force_never_removes_a_capture() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
-    // As a Blender capture has them.
+    // As in a Blender capture.
     for name in ["train", "test", "val"] {
         std::fs::create_dir_all(capture.join(name)).unwrap();
         std::fs::copy(capture.join("images/cam0/0000.png"), capture.join(name).join("r_0.png")).unwrap();
@@ -80,7 +80,7 @@ fn a_folder_in_use_is_refused_and_read() {
     let said = splat4d(&["convert", str(&file), str(&run.join("scene.safetensors"))]).run().failed();
     assert!(said.contains(&told) && !run.join("scene.safetensors").exists(), "{said}");
     drop(owner);
-    // What a kill right after the start leaves: `--resume` begins again, as the command asked for it.
+    // What a kill right after the start leaves: `--resume` begins again, as the command requested it.
     splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
     let wanted = std::fs::read(run.join("scene.safetensors")).unwrap();
     assert!(!run.join(".splat4d/asked").exists(), "what is done is not continued");
@@ -118,7 +118,7 @@ fn a_folder_in_use_is_refused_and_read() {
 }
 
 #[test]
-fn no_output_replaces_what_is_read() {
+fn no_output_replaces_an_input() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     write_ply(&at("a.ply"), 0.0);
@@ -137,7 +137,7 @@ fn no_output_replaces_what_is_read() {
         splat4d(words).run().refused();
         assert!(std::fs::read(&ply).unwrap() == before && !at("a.s4d").exists(), "{words:?}");
     }
-    // An ending states what is wanted, and a file may be replaced that is not read.
+    // The extension states the format, and a file may be replaced that is not read.
     splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
     assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
     splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
@@ -156,7 +156,7 @@ fn no_output_replaces_what_is_read() {
 
 /// A capture whose images, points and a mask are elsewhere: they are as safe as those in its folder.
 #[test]
-fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
+fn no_output_replaces_external_files_of_a_capture() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     let mut sample = Capture::new(&at("sets"));

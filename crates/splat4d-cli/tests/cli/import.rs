@@ -67,12 +67,12 @@ fn images_alone_become_a_capture_with_clocks_and_poses() {
     }
 }
 
-/// Samples of sound a second, and the films' frames a second: slow, so that a second of images is long enough to
+/// Samples of sound a second, and the films' frames per second: slow, so that a second of images is long enough to
 /// listen.
 const SOUND_RATE: u32 = 16_000;
 const SLOW: usize = 10;
 
-/// A WAV file of what a camera hears that begins after so many seconds: bursts of noise, the same for all.
+/// A WAV file of a camera's sound that begins after this many seconds: bursts of noise, the same for all.
 fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
     let noise = |stream: u64, k: u64| {
         let mut z = (stream << 32 | k).wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -243,7 +243,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     assert!(refused(&at("missing.toml")).contains("missing.toml"));
 }
 
-/// A program that notes how it is called and, as the mapper, copies a model to where it is asked for.
+/// A program that notes how it is called and, as the mapper, copies a model to where it is requested.
 #[cfg(unix)]
 fn stand_in(folder: &Path, ends: &str) {
     use std::os::unix::fs::PermissionsExt;
@@ -305,7 +305,7 @@ fn colmap_runs_on_request_and_its_model_is_used() {
     ]) {
         assert!(words.iter().all(|w| line.contains(w)), "{line}");
     }
-    // The world is turned to where walls and floor lie: a camera seen from the first is where the model has it.
+    // The world is aligned with walls and floor: relative poses equal those of the model.
     let made = json_of(&take.join("capture.json"));
     let from_first = |cameras: &[Value], k: usize, unit: f64| -> [[f64; 4]; 3] {
         let number = |k: usize, i: usize, j: usize| cameras[k]["world_to_camera"][i][j].as_f64().unwrap();
@@ -350,7 +350,10 @@ fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     );
     assert!(refused.contains("--synchronous") && refused.contains("keep_offset"), "{refused}");
     assert!(!take.join("capture.json").exists());
-    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "results so far are kept");
+    assert!(
+        take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(),
+        "existing results are kept"
+    );
     // The times of the files, on the user's word.
     import(&["--synchronous"]).ok();
     let report = json_of(&take.join("import/report.json"));
@@ -384,7 +387,7 @@ fn images_of_one_time_need_no_time_offsets() {
 }
 
 #[test]
-fn what_cannot_be_imported_is_explained() {
+fn unsupported_inputs_are_refused_with_a_reason() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let take = at("take");
@@ -417,7 +420,7 @@ fn what_cannot_be_imported_is_explained() {
     }
     let alone = refused(&far, &[]);
     assert!(alone.contains("20 degrees"), "{alone}");
-    // Given clocks so far apart that no time is shared.
+    // Given time offsets without a common time.
     let path = take.join("import.toml");
     let text = std::fs::read_to_string(&path).unwrap();
     let mut offsets = ["0.0", "100.0"].iter();

@@ -1,6 +1,6 @@
 //! `predict` on a tiny run that did not see the end of its take: what it leaves, what it states, what it refuses.
 
-use crate::sample::{Answer, Capture, splat4d};
+use crate::sample::{Capture, Output, splat4d};
 use crate::{TINY, json_of, str};
 use splat4d::format::{playback, scene};
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const FRAMES: usize = 10;
 const SHARE: &str = "0.75";
 
-/// A capture and a run of it that saw a share of it. Twenty steps teach no motion: what is learnt is made to drift.
+/// A capture and a run on a share of it. Twenty steps learn no motion, so the learnt scene is made to drift.
 fn seen(work: &Path, share: &str) -> (PathBuf, PathBuf) {
     let mut sample = Capture::new(work);
     sample.frames = FRAMES;
@@ -27,7 +27,7 @@ fn seen(work: &Path, share: &str) -> (PathBuf, PathBuf) {
     (capture, run)
 }
 
-fn predict(run: &Path, args: &[&str]) -> Answer {
+fn predict(run: &Path, args: &[&str]) -> Output {
     splat4d(&["predict", str(run), "--steps", "3", "--nodes", "4"]).args(args).run()
 }
 
@@ -67,7 +67,7 @@ fn a_run_is_forecast_and_compared_with_later_frames() {
 }
 
 #[test]
-fn what_cannot_be_predicted_is_refused_with_a_remedy() {
+fn unpredictable_runs_are_refused_with_a_remedy() {
     let work = tempfile::tempdir().unwrap();
     let (capture, run) = seen(work.path(), SHARE);
     let actions = |text: &str| {

@@ -136,7 +136,7 @@ impl Capture {
     }
 }
 
-/// Files of a folder that a user sees, in the order of their names: without the record of what splat4d wrote there.
+/// Visible files of a folder, in the order of their names: without the record of what splat4d wrote there.
 pub(crate) fn shown(folder: &Path) -> Vec<PathBuf> {
     let all = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
     let mut files: Vec<PathBuf> = all.filter(|p| !p.file_name().unwrap().to_string_lossy().starts_with('.')).collect();
@@ -152,7 +152,7 @@ pub(crate) struct Call {
 }
 
 /// How it went.
-pub(crate) struct Answer {
+pub(crate) struct Output {
     call: String,
     code: Option<i32>,
     stdout: String,
@@ -190,16 +190,16 @@ impl Call {
     }
 
     /// Runs in the current folder.
-    pub(crate) fn run(self) -> Answer {
+    pub(crate) fn run(self) -> Output {
         self.run_in(Path::new("."))
     }
 
     /// Runs in a folder.
-    pub(crate) fn run_in(self, folder: &Path) -> Answer {
+    pub(crate) fn run_in(self, folder: &Path) -> Output {
         let mut command = Command::new(PROGRAM.expect("cargo builds the program"));
         command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         let output = command.args(&self.args).current_dir(folder).output().unwrap();
-        Answer {
+        Output {
             call: format!("{:?}", self.args),
             code: output.status.code(),
             stdout: String::from_utf8(output.stdout).unwrap(),
@@ -208,14 +208,14 @@ impl Call {
     }
 }
 
-impl Answer {
+impl Output {
     /// Standard output of a call that worked.
     pub(crate) fn ok(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
         self.stdout
     }
 
-    /// All that a call that worked said.
+    /// All output of a successful call.
     pub(crate) fn all(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
         self.stdout + &self.stderr

@@ -32,7 +32,7 @@ fn cameras() -> Vec<Camera> {
     [[0.4, 0.3, -4.0], [3.5, 0.3, -2.0], [-3.0, 0.5, -2.0]].map(at).to_vec()
 }
 
-/// Images of a scene, said to be of another time.
+/// Images of a scene, labelled with another time.
 struct ShiftedImages {
     cameras: Vec<Camera>,
     pictures: Vec<splat4d::scene::Planes<f32>>,

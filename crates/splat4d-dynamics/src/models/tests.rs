@@ -4,11 +4,11 @@ use crate::score::{node_errors, skill};
 use crate::worlds::World;
 use splat4d::math::se3::{norm, sub};
 
-/// Of the 1,500 that the models have: as many as the pendulum asks of each.
+/// Of the 1,500 that the models have: as many as the pendulum requires of each.
 const CAUSAL_STEPS: usize = 200;
 const GRAPH_STEPS: usize = 100;
 
-/// True node paths of a world: the first `seen` frames with rotations, and what comes after.
+/// True node paths of a world: the first `seen` frames with rotations, and the later frames.
 fn world(name: &str, seen: usize) -> (Paths, Vec<Moment>, Option<Actions>) {
     let world = World::new(name).unwrap();
     let all: Vec<Vec<[f64; 3]>> = (0..crate::worlds::FRAMES).map(|t| world.nodes(t)).collect();

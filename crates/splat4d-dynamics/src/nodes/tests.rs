@@ -11,11 +11,11 @@ use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params};
 const FPS: f64 = 10.0;
 const STILL: usize = 300;
 const BODY: usize = 80;
-/// Scene units a second.
+/// Scene units per second.
 const VELOCITY: [f64; 3] = [0.5, 0.2, 0.0];
 
-/// A still room and a body that drifts through it. Where `lives` holds, no Gaussian of the body lives longer than a third of a
-/// second: others take over along its way.
+/// A still room and a body that drifts through it. If `lives` is set, no Gaussian of the body has a lifespan longer
+/// than a third of a second: others take over along its way.
 fn scene(lives: bool) -> Scene<f32> {
     let generations = if lives { 8 } else { 1 };
     let mut params = Params::new(STILL + BODY * generations, 1, LifeKind::GaussHalf.columns());
@@ -26,7 +26,7 @@ fn scene(lives: bool) -> Scene<f32> {
         let x: [f64; 3] = std::array::from_fn(|c| rng.uniform(c as u64) - 0.5);
         let body = row >= STILL;
         let center = if lives && body { 0.25 * ((row - STILL) / BODY) as f64 } else { 1.0 };
-        // The model moves about the middle of a life.
+        // The model moves about the middle of a lifespan.
         let place = |c: usize| if body { 0.4 * x[c] - 0.5 + VELOCITY[c] * center } else { 4.0 * x[c] };
         let logs = [-3.0f32; 3];
         let x: [f32; 3] = std::array::from_fn(|c| place(c) as f32);
@@ -50,7 +50,8 @@ fn nodes_follow_moving_regions_of_short_lived_gaussians() {
         let scene = scene(lives);
         let seen = observe(&scene, &ticks(), 12).unwrap();
         assert_eq!((seen.paths.nodes(), seen.paths.len()), (12, 16));
-        // Who has hardly any neighbour but what moves goes along with it (the room is thin here); all others are left out.
+        // Who has hardly any neighbour but what moves goes along with it (the room is thin here); all others are left
+        // out.
         let middle = add([-0.5; 3], se3::scale(VELOCITY, 1.5));
         let at = |i: usize| scene.layers[0].params[GEOMETRY].read::<3>(i, 0).map(f64::from);
         let far = |i: &usize| norm(sub(at(*i), middle)) > 1.3;
@@ -64,7 +65,7 @@ fn nodes_follow_moving_regions_of_short_lived_gaussians() {
                 assert!(norm(sub(way, truth)) < tolerance, "node {k} at {t}: {way:?}, {truth:?}");
             }
         }
-        // Nothing was asked of the scene after the last tick: what is there does not matter.
+        // The scene was not evaluated after the last tick: its content there does not matter.
         let shorter = observe(&scene, &ticks()[..10], 12).unwrap();
         assert_eq!(shorter.paths.len(), 10);
     }
@@ -125,7 +126,7 @@ fn a_predicted_scene_equals_the_scene_and_then_continues() {
 }
 
 #[test]
-fn what_cannot_be_observed_is_explained() {
+fn impossible_observations_are_refused_with_a_reason() {
     let scene = scene(false);
     let message = |ticks: &[f64], nodes| observe(&scene, ticks, nodes).unwrap_err().to_string();
     assert!(message(&ticks()[..3], 12).contains("too few"));

@@ -14,7 +14,8 @@ use splat4d::scene::Planes;
 use splat4d_train::vision::raster::sample;
 use std::str::FromStr;
 
-/// A kind of tags: how many bits they have, and which patterns are among them. Dictionaries of fewer tags are beginnings of these.
+/// A kind of tags: how many bits they have, and which patterns are among them. Dictionaries of fewer tags are
+/// beginnings of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Family {
     /// Its name.
@@ -23,11 +24,11 @@ pub struct Family {
     side: usize,
     /// Bits that may be wrong: fewer than half of the least distance of two patterns, and so few that noise makes none.
     wrong: u32,
-    /// Patterns row by row, white 1, the first bit highest, as OpenCV draws them; hexadecimal.
+    /// Patterns row by row, white 1, the first bit highest, as OpenCV renders them; hexadecimal.
     codes: &'static str,
 }
 
-/// What is known. Least distances of two patterns, turned or not: 11, 3, 6, 11 bits.
+/// Supported families. Least distances of two patterns, turned or not: 11, 3, 6, 11 bits.
 const FAMILIES: [Family; 4] = [
     Family { name: "36h11", side: 6, wrong: 2, codes: include_str!("36h11.txt") },
     Family { name: "4x4", side: 4, wrong: 0, codes: include_str!("4x4.txt") },
@@ -62,7 +63,7 @@ impl FromStr for Board {
     fn from_str(text: &str) -> Result<Self> {
         let wrong = |what: String| {
             Err(Error::input(format!("the board \"{text:.80}\" {what}")).remedy(format!(
-                "Write FAMILY:METRES, the length of a tag's dark square, and :floor or :wall if it lies flat or stands upright: \
+                "Write FAMILY:METRES, the length of a tag's dark square, and :floor or :wall if it is flat or upright: \
                  36h11:0.16:floor. Families are {}.",
                 FAMILIES.map(|f| f.name).join(", ")
             )))
@@ -93,11 +94,11 @@ impl FromStr for Board {
 pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
-    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is examined.
+    /// Pixels of the dark square's corners: from the first bit's on, clockwise when the tag is examined.
     pub corners: [[f64; 2]; 4],
 }
 
-/// The tags of a family in a grey image, by number; those that are there twice are left out.
+/// The tags of a family in a grey image, by number; duplicates are left out.
 pub(crate) fn tags(picture: &Planes<f32>, family: &Family) -> Vec<Tag> {
     let codes = family.codes();
     let mut found: Vec<Tag> =
@@ -176,13 +177,14 @@ impl Family {
     }
 }
 
-/// What takes the unit square to four corners: a homography.
+/// Homography from the unit square to four corners.
 struct Square {
     h: [f64; 8],
 }
 
 impl Square {
-    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them are on a line.
+    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them are on
+    /// a line.
     fn new(&[a, b, c, d]: &[[f64; 2]; 4]) -> Option<Self> {
         let (e, f) = ([b[0] - c[0], b[1] - c[1]], [d[0] - c[0], d[1] - c[1]]);
         let sum = [a[0] - b[0] + c[0] - d[0], a[1] - b[1] + c[1] - d[1]];

@@ -6,14 +6,14 @@ use splat4d_train::vision::raster::sample;
 /// Pixels of a tile whose brightest and darkest pixel, with those of its neighbours, give the threshold for dark:
 /// AprilTag's.
 const TILE: usize = 4;
-/// The least difference of them: what is plainer is neither dark nor bright (AprilTag: 5 of 255).
+/// The least difference of them: smaller differences are neither dark nor bright (AprilTag: 5 of 255).
 const PLAIN: f32 = 0.04;
 /// Pixels of a tag's shorter side at least: two for each bit and border of the smallest family.
 const SMALLEST: f64 = 12.0;
 /// How far the outline may be from the four edges, pixels and of the perimeter (OpenCV's polygons: 3 %).
 const BENT: [f64; 2] = [1.5, 0.012];
 
-/// Corners of all such regions, as the hands of a clock go.
+/// Corners of all such regions, clockwise.
 pub(super) fn quads(picture: &Planes<f32>) -> Vec<[[f64; 2]; 4]> {
     let (w, h) = (picture.width, picture.height);
     if w < 4 * TILE || h < 4 * TILE {
@@ -79,7 +79,7 @@ fn dark(picture: &Planes<f32>) -> Vec<bool> {
         }
         all
     };
-    // A tile without edges, such as one inside of a wide border, goes by what is around it until there is one.
+    // A tile without edges, such as one inside of a wide border, uses its neighbours until there is one.
     let mut limits: Vec<Option<f32>> = (0..across * down)
         .map(|t| {
             let [low, high] = wide(t);
@@ -94,7 +94,7 @@ fn dark(picture: &Planes<f32>) -> Vec<bool> {
 
 /// Gives limits to tiles that have none: the mean of their neighbours', ring after ring.
 fn filled(limits: &mut [Option<f32>], across: usize) {
-    /// Rings: tags whose bits are wider than so many tiles twice are not found.
+    /// Rings: tags with bits wider than twice this many tiles are not found.
     const RINGS: usize = 12;
     let down = limits.len() / across;
     for _ in 0..RINGS {
@@ -154,7 +154,7 @@ fn outline(members: &[usize], w: usize) -> Option<Vec<[f64; 2]>> {
     Some(out)
 }
 
-/// How far a point is to the right of the line from a to b, pixels (y down: outside of corners that go like a clock is left).
+/// How far a point is to the right of the line from a to b, pixels (y down: for clockwise corners, outside is left).
 fn beside(a: [f64; 2], b: [f64; 2], p: [f64; 2]) -> f64 {
     let d = [b[0] - a[0], b[1] - a[1]];
     (d[0] * (p[1] - a[1]) - d[1] * (p[0] - a[0])) / d[0].hypot(d[1]).max(1e-12)
@@ -194,7 +194,7 @@ fn corners(outline: &[[f64; 2]]) -> Option<[[f64; 2]; 4]> {
 fn laid(picture: &Planes<f32>, quad: &[[f64; 2]; 4]) -> Option<[[f64; 2]; 4]> {
     /// Of an edge, what is left out at either end: corners are round.
     const ENDS: f64 = 0.12;
-    /// Pixels to either side in which the edge lies, at most, and of its length: a border is an eighth of that.
+    /// Pixels to either side that contain the edge, at most, and of its length: a border is an eighth of that.
     const REACH: [f64; 2] = [3.0, 0.08];
     /// Steps of a pixel.
     const STEPS: f64 = 4.0;

@@ -61,7 +61,7 @@ fn family(name: &str) -> Family {
     FAMILIES.into_iter().find(|f| f.name == name).expect("it is known")
 }
 
-/// Pixels between the drawn corners and the found ones, at most.
+/// Pixels between the rendered corners and the found ones, at most.
 fn worst(camera: &Camera, put: &Put, found: &Tag) -> f64 {
     let corners =
         [put.corner, add(put.corner, put.right), add(add(put.corner, put.right), put.down), add(put.corner, put.down)];
@@ -73,7 +73,7 @@ fn worst(camera: &Camera, put: &Put, found: &Tag) -> f64 {
 }
 
 #[test]
-fn tags_of_all_families_are_read_from_askew() {
+fn tags_of_all_families_are_read_at_an_angle() {
     for (k, name) in ["36h11", "4x4", "5x5", "6x6"].into_iter().enumerate() {
         let family = family(name);
         let id = [581, 7, 249, 120][k];

@@ -36,7 +36,7 @@ fn read(text: &Text) -> Result<Said> {
 
 fn number(tree: &Tree, key: &str) -> Result<f64> {
     let value = tree.get(key).and_then(Tree::number).filter(|v| v.is_finite());
-    value.ok_or_else(|| Error::input(format!("{key} is missing or no number")).remedy("See docs/capture-format.md."))
+    value.ok_or_else(|| Error::input(format!("{key} is missing or not a number")).remedy("See docs/capture-format.md."))
 }
 
 /// Numbers of a list in the lens; none where it is left out.

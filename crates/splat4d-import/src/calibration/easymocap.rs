@@ -7,7 +7,7 @@ use splat4d::{Error, Result};
 
 pub(super) const DIALECT: Dialect = Dialect { name: "EasyMocap (intri.yml, extri.yml)", reads, read };
 
-/// What stands before a camera's name.
+/// Prefix of a camera's name.
 const KEYS: [&str; 4] = ["K_", "Rot_", "R_", "T_"];
 
 /// Names of cameras: as listed, else as keys have them.

@@ -14,8 +14,8 @@ pub(crate) struct Video<'a> {
 
 /// For every video the number of its camera, and sentences about what was assumed.
 ///
-/// By name; else by a word of the video's name that is a camera's name; else, where cameras have nothing but numbers, by the
-/// number in the video's name. Never by order alone.
+/// By name; else by a word of the video's name that is a camera's name; else, where cameras have nothing but numbers,
+/// by the number in the video's name. Never by order alone.
 ///
 /// Errors: a video without a camera; names that fit several.
 pub(crate) fn assign(calibration: &Calibration, videos: &[Video<'_>]) -> Result<(Vec<usize>, Vec<String>)> {
@@ -62,7 +62,7 @@ fn named(cameras: &[Calibrated], fits: &dyn Fn(&str) -> bool) -> Vec<usize> {
     cameras.iter().enumerate().filter_map(of).collect()
 }
 
-/// One camera for every video, none twice.
+/// One camera for every video, without duplicates.
 fn sure(found: &[Vec<usize>]) -> Option<Vec<usize>> {
     let all: Vec<usize> =
         found.iter().map(|f| <[usize; 1]>::try_from(f.as_slice()).ok().map(|f| f[0])).collect::<Option<_>>()?;
@@ -72,7 +72,7 @@ fn sure(found: &[Vec<usize>]) -> Option<Vec<usize>> {
     (once.len() == all.len()).then_some(all)
 }
 
-/// The words of a name: what stands between spaces, dashes and the like.
+/// The words of a name: the parts between spaces, dashes and the like.
 fn words(name: &str) -> impl Iterator<Item = String> + '_ {
     name.split(|c: char| !c.is_alphanumeric()).filter(|w| !w.is_empty()).map(str::to_owned)
 }
@@ -83,7 +83,8 @@ fn number(name: &str) -> Option<u64> {
     name[name.len() - digits..].parse().ok()
 }
 
-/// By number, where all names of cameras are one word and a number, and videos have the same numbers (or all one more or less).
+/// By number, where all names of cameras are one word and a number, and videos have the same numbers (or all one more
+/// or less).
 fn by_number(cameras: &[Calibrated], videos: &[Video<'_>]) -> Option<Vec<usize>> {
     let plain = |name: &str| -> Option<u64> {
         let rest = name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches(['_', '-', ' ']).to_lowercase();

@@ -30,7 +30,7 @@ use tree::Tree;
 /// A camera of a calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibrated {
-    /// What it is called; the first is its name, others are what its video may be called too.
+    /// Its names; the first is the camera's, others may be those of its video.
     pub names: Vec<String>,
     /// Pixels across and down of the images that it was calibrated with, where the file states it.
     pub size: Option<[usize; 2]>,
@@ -61,9 +61,9 @@ pub struct Calibration {
     pub cameras: Vec<Calibrated>,
     /// The unit of lengths.
     pub unit: Unit,
-    /// Points that come with it.
+    /// Its points.
     pub points: Option<PointCloud>,
-    /// What was left out or is odd, a sentence each.
+    /// Remarks on omitted or odd content, a sentence each.
     pub notes: Vec<String>,
 }
 
@@ -73,7 +73,7 @@ struct Text {
     tree: Tree,
 }
 
-/// What a file states of a camera; two files may share what there is to say.
+/// A camera in a file; two files may each state a part.
 #[derive(Clone, Debug, Default)]
 struct Part {
     names: Vec<String>,
@@ -82,7 +82,7 @@ struct Part {
     pose: Option<Se3>,
 }
 
-/// What a file states.
+/// Content of a file.
 #[derive(Default)]
 struct Said {
     parts: Vec<Part>,
@@ -110,7 +110,8 @@ const MAX_FILES: usize = 1000;
 
 /// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
 ///
-/// Errors: nothing that is known; damage; matrices that are missing or none; a camera twice; lenses that captures cannot have.
+/// Errors: an unknown format; damage; missing or invalid matrices; a duplicate camera; lenses that captures cannot
+/// have.
 pub fn read(path: &Path) -> Result<Calibration> {
     let there = std::fs::metadata(path).map_err(|e| {
         Error::io("the calibration cannot be read", e).at(path.display()).remedy("Check the path behind --calibration.")
@@ -157,7 +158,7 @@ pub fn read(path: &Path) -> Result<Calibration> {
         return Err(Error::new(ErrorKind::Unsupported, format!("no calibration of cameras is found ({why:.600})"))
             .at(path.display())
             .remedy(format!(
-                "Known are: a COLMAP reconstruction, {}; see docs/filming.md.",
+                "Supported are: a COLMAP reconstruction, {}; see docs/filming.md.",
                 DIALECTS.map(|d| d.name).join(", ")
             )));
     }
@@ -204,7 +205,9 @@ impl Text {
         let fail = |e| Error::io("cannot be read", e).at(path.display());
         let length = std::fs::metadata(path).map_err(fail)?.len();
         if length > MAX_BYTES {
-            return Err(Error::input(format!("it is {length} bytes long: no calibration")).at(path.display()));
+            return Err(
+                Error::input(format!("it is {length} bytes long, which is not a calibration")).at(path.display())
+            );
         }
         let bytes = splat4d_train::files::read(path)?;
         let tree = splat4d_train::text::decode(&bytes)
@@ -238,7 +241,7 @@ fn same_name(a: &str, b: &str) -> bool {
     a.to_lowercase() == b.to_lowercase()
 }
 
-/// Joins what several files say of a camera.
+/// Joins what several files contain about a camera.
 fn add(parts: &mut Vec<(Part, PathBuf)>, part: Part, file: &Path) -> Result<()> {
     let name = part.names.first().cloned().unwrap_or_default();
     let Some((known, first)) = parts.iter_mut().find(|(p, _)| same_name(&p.names[0], &name)) else {
@@ -293,14 +296,15 @@ fn alike(cameras: &[Calibrated]) -> Result<()> {
 }
 
 impl Calibration {
-    /// Whether it says where the cameras stand.
+    /// Whether it states where the cameras stand.
     pub(crate) fn posed(&self) -> bool {
         self.cameras.iter().all(|c| c.pose.is_some())
     }
 
-    /// What its unit of length is, a sentence.
+    /// Its unit of length, a sentence.
     pub(crate) fn about_lengths(&self) -> String {
-        /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer millimetres too.
+        /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer
+        /// millimetres too.
         const MILLIMETRES: f64 = 200.0;
         let centers: Vec<[f64; 3]> =
             self.cameras.iter().filter_map(|c| c.pose.map(|p| p.inverse().translation)).collect();

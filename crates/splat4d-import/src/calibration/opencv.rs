@@ -1,5 +1,6 @@
-//! Camera matrix, distortion, rotation and translation as OpenCV has them, under the names that programs give them: OpenCV's and
-//! ROS' file for each camera, OpenPose's XML, the tables of anipose, Pose2Sim, FreeMoCap and Caliscope, JSON with a key per camera.
+//! Camera matrix, distortion, rotation and translation as in OpenCV, under the names that programs give them: OpenCV's
+//! and ROS' file for each camera, OpenPose's XML, the tables of anipose, Pose2Sim, FreeMoCap and Caliscope, JSON with a
+//! key per camera.
 
 use super::tree::{Matrix, Tree};
 use super::{Dialect, Part, Said, Text};
@@ -47,7 +48,7 @@ fn find<'a>(tree: &'a Tree, keys: &[&str]) -> Option<(&'a str, &'a Tree)> {
     keys.iter().find_map(of).map(|(k, v)| (k.as_str(), v))
 }
 
-/// Where a program has not calibrated yet, it writes nothing, null or an empty list.
+/// Uncalibrated cameras are missing, null or an empty list.
 fn is_empty(tree: &Tree) -> bool {
     match tree {
         Tree::Word(word) => word.is_empty() || word == "null" || word == "~",
@@ -62,7 +63,7 @@ fn is_camera(tree: &Tree) -> bool {
     shaped(&MATRIX) || shaped(&EXTRINSICS) || shaped(&ROTATION) && shaped(&TRANSLATION)
 }
 
-/// The cameras of a file: itself, its tables, or the tables in `cameras`; with the keys they stand under.
+/// The cameras of a file: itself, its tables, or the tables in `cameras`; with the keys they are under.
 fn cameras(tree: &Tree) -> Vec<(Option<String>, &Tree)> {
     if is_camera(tree) {
         return vec![(None, tree)];

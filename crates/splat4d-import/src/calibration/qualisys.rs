@@ -1,5 +1,5 @@
-//! Qualisys' .qca.txt and calibration XML. Focal lengths and principal points are in 64ths of a pixel, places in millimetres; the
-//! camera's axes are x right, y up, z backward, as columns of R. Distortion is OpenCV's.
+//! Qualisys' .qca.txt and calibration XML. Focal lengths and principal points are in 64ths of a pixel, positions in
+//! millimetres; the camera's axes are x right, y up, z backward, as columns of R. Distortion is OpenCV's.
 
 use super::tree::Tree;
 use super::{Dialect, Part, Said, Text, Unit};

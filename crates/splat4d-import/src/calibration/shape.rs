@@ -15,18 +15,18 @@ const MOST_BARS: f64 = 0.45;
 /// Pixels of the stored images that bars may be wider or narrower than they should.
 const BAR_ROUNDING: f64 = 3.0;
 
-/// How a video of another size has come of the calibrated images.
+/// Relation of a video of another size to the calibrated images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// Scaled as a whole.
     Scaled,
-    /// As it was; a codec's padding is gone, or is left in.
+    /// The same size; a codec's padding is removed or kept.
     Padded,
-    /// Perhaps scaled to fit, with so many pixels of the video in bars at the sides, and above and below.
+    /// Perhaps scaled to fit, with this many pixels of the video in bars at the sides, and above and below.
     Boxed([f64; 2]),
 }
 
-/// How a video can have come of the calibrated images.
+/// Possible relations of a video to the calibrated images.
 ///
 /// Errors: it is of another shape.
 pub(crate) fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
@@ -60,13 +60,11 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
     format!("the video has {}x{} pixels, the calibration is for {}x{}", video[0], video[1], size[0], size[1])
 }
 
-/// The camera for images of a video's size that are stored in another one, where so many pixels of the stored images
-/// are black
-/// bars: at the left, above, at the right, below. And what that means, a sentence, where it is not plain.
+/// The camera for images of a video's size that are stored in another one, where this many pixels of the stored images
+/// are black bars: at the left, above, at the right, below. And what that means, a sentence, where it is not plain.
 ///
 /// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
-/// why; the
-/// principal point lies outside.
+/// why; the principal point is outside.
 pub(crate) fn fitted(
     camera: &Calibrated,
     video: [usize; 2],
@@ -117,7 +115,7 @@ pub(crate) fn fitted(
 
 /// Pixels of black bars at the left, above, at the right and below, that all these grey images of one size have.
 pub(crate) fn bars(pictures: &[Planes<f32>]) -> [f64; 4] {
-    /// In [0, 1]: what is brighter in the mean of a line, or anywhere in it, is no bar. Codecs make black noisy.
+    /// In [0, 1]: what is brighter in the mean of a line, or anywhere in it, is not a bar. Codecs make black noisy.
     const MEAN: f32 = 0.1;
     const ANY: f32 = 0.25;
     let Some(first) = pictures.first() else { return [0.0; 4] };

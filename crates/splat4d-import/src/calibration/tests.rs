@@ -303,7 +303,7 @@ fn opencv_and_openpose_files_of_each_camera_are_read() {
     };
     let both = serde_json::json!({"left": json(&truth[0]), "right": json(&truth[1])}).to_string();
     same(&folder(&[("calibration.json", both)]).unwrap(), &truth);
-    // A lens and no place.
+    // A lens and no position.
     let alone: Vec<(&str, String)> =
         yaml.iter().map(|(f, t)| (*f, t.split("rotation:").next().unwrap().to_owned())).collect();
     let bare: Vec<Calibrated> = truth.iter().map(|c| Calibrated { pose: None, ..c.clone() }).collect();
@@ -515,7 +515,7 @@ fn intrinsics_follow_the_size_and_other_shapes_are_refused() {
     let bare = Calibrated { size: None, ..camera.clone() };
     assert_eq!(whole(&bare, [1280, 720], [1280, 720]).unwrap().intrinsics, camera.intrinsics);
     assert!(whole(&bare, [640, 360], [640, 360]).unwrap_err().to_string().contains("principal point"));
-    // A point is seen at the same place of the image.
+    // A point is seen at the same position of the image.
     let x = mat_vec(&pose_of(camera).rotation, [0.3, 0.2, 0.1]);
     let z = x[2] + pose_of(camera).translation[2];
     let at = |c: &Calibrated| c.intrinsics.fx * x[0] / z + c.intrinsics.cx;

@@ -5,7 +5,7 @@ use splat4d::{Error, Result};
 /// A value with others in it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Tree {
-    /// A number; NaN and infinities as they stand there.
+    /// A number; NaN and infinities as written.
     Number(f64),
     /// Anything else that is one.
     Word(String),
@@ -17,7 +17,7 @@ pub(super) enum Tree {
     Element(String, Vec<(String, String)>, Vec<Tree>),
 }
 
-/// Deepest nesting that is followed, and that is given to a parser: some go down as deep as the text does.
+/// Deepest nesting, also checked before parsing, because some parsers recurse as deep as the text.
 const MAX_DEPTH: usize = 64;
 const DEEPEST: usize = 256;
 
@@ -111,7 +111,7 @@ impl Tree {
         }
     }
 
-    /// A word or a number, as it is written.
+    /// A word or a number, as written.
     pub(super) fn text(&self) -> Option<String> {
         match self {
             Self::Word(word) => Some(word.clone()),
@@ -128,7 +128,7 @@ impl Tree {
         }
     }
 
-    /// A matrix: rows and columns, and its numbers row by row. A plain list is a column. None: it is no matrix.
+    /// A matrix: rows and columns, and its numbers row by row. A plain list is a column. None: it is not a matrix.
     pub(super) fn matrix(&self) -> Option<Matrix> {
         if let (Some(rows), Some(columns), Some(data)) = (self.get("rows"), self.get("cols"), self.get("data")) {
             let data = data.list()?.iter().map(Tree::number).collect::<Option<Vec<f64>>>()?;

@@ -1,4 +1,4 @@
-//! What a camera's own images say.
+//! Findings from a camera's own images.
 
 use super::finding::{FindingList, GAMMA, SHARPNESS, grade, unit, worse};
 use super::look::CameraObservations;
@@ -6,7 +6,7 @@ use super::{Grade, Report};
 use crate::sync::median;
 use splat4d_train::capture::Capture;
 
-/// The static background went so far, pixels of 1920, and at least so many own ones.
+/// Motion of the static background that is reported, pixels of 1920, and at least this many own ones.
 pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
 pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.
@@ -18,17 +18,17 @@ const FRAMES: [f64; 2] = [0.01, 0.05];
 const CLIPPED: f64 = 0.6;
 /// Mean below which an image is too dark, of 255.
 const DARK: f64 = 20.0;
-/// How much larger steps across blocks are, of 255. Images of two recordings that look sound have 0.9 to 1.4.
+/// How much larger steps across blocks are, of 255. Images of two recordings without visible blocks have 0.9 to 1.4.
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
-/// What a camera's own images say.
+/// Findings from a camera's own images.
 pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, report: &mut Report) {
     let name = capture.cameras[camera].name.clone();
     let who = Some(name.as_str());
-    if let (Some(moved), Some(stand)) = (s.moved, s.stands.first()) {
-        let far = moved * unit(&stand.view);
+    if let (Some(moved), Some(viewpoint)) = (s.moved, s.viewpoints.first()) {
+        let far = moved * unit(&viewpoint.view);
         report.cameras[camera].moved = Some(far);
-        let limits = worse(MOVED, MOVED_PIXELS.map(|p| p * unit(&stand.view)));
+        let limits = worse(MOVED, MOVED_PIXELS.map(|p| p * unit(&viewpoint.view)));
         if let Some(g) = grade(far, limits) {
             let what =
                 format!("Camera {name} moved: the background moved by {far:.1} px (of 1920) from first to last.");
@@ -103,7 +103,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
                 who,
                 (soft as f64, "frames"),
                 what,
-                ("Softness that comes and goes.", "Shorter exposure, fixed focus; leave these images out."),
+                ("Sharpness that varies.", "Shorter exposure, fixed focus; leave these images out."),
             );
         }
     }

@@ -1,7 +1,7 @@
-//! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
+//! Findings of pairs of cameras: poses, exposure, white balance and sharpness, by features that two of them see.
 
 use super::finding::{AGREE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
-use super::look::{CameraObservations, Stand, detail};
+use super::look::{CameraObservations, Viewpoint, detail};
 use super::{Options, PairReport, Report};
 use crate::sfm::pictures::{CameraView, Feature};
 use crate::sfm::tracks::{Pairing, links};
@@ -19,12 +19,12 @@ use splat4d_train::vision::raster::grey;
 
 /// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
 pub(super) const EPIPOLAR: [f64; 2] = [1.0, 2.0];
-/// And at least so many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
+/// And at least this many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
 pub(super) const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
 /// Exposure, and one channel against green, stops.
 pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];
-/// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose axes
-/// are farther apart most, degrees.
+/// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose
+/// axes are farther apart most, degrees.
 const SURE: usize = 20;
 const APART: f64 = 60.0;
 const TELL: usize = 3;
@@ -36,15 +36,15 @@ const TIMES: f64 = 0.15;
 /// Half the side of what is compared for sharpness, pixels.
 const PATCH: usize = 8;
 
-fn planes(stand: &Stand) -> Planes<f32> {
-    let values: Vec<f32> = stand.picture.data.iter().map(|v| f32::from(*v) / 255.0).collect();
-    Planes::from_interleaved(3, stand.picture.height, stand.picture.width, &values)
+fn planes(viewpoint: &Viewpoint) -> Planes<f32> {
+    let values: Vec<f32> = viewpoint.picture.data.iter().map(|v| f32::from(*v) / 255.0).collect();
+    Planes::from_interleaved(3, viewpoint.picture.height, viewpoint.picture.width, &values)
 }
 
-fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> CameraView {
+fn sight(name: &str, number: usize, viewpoint: &Viewpoint, most: usize) -> CameraView {
     /// Least contrast of a feature, as structure from motion takes it.
     const CONTRAST: f64 = 0.004;
-    let found = find(&grey(&planes(stand)), Limits { contrast: CONTRAST, most }, &|_, _| true);
+    let found = find(&grey(&planes(viewpoint)), Limits { contrast: CONTRAST, most }, &|_, _| true);
     let feature = |f: &splat4d_train::vision::features::Feature| Feature {
         pixel: f.pixel,
         velocity: [0.0; 2],
@@ -54,7 +54,7 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> CameraView {
     };
     CameraView {
         name: name.to_owned(),
-        size: [stand.picture.width, stand.picture.height],
+        size: [viewpoint.picture.width, viewpoint.picture.height],
         factor: 1.0,
         focal: None,
         exact: false,
@@ -66,9 +66,9 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> CameraView {
     }
 }
 
-/// The mean of a channel around a place, and the patch's detail relative to its brightness.
-fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
-    let p = &stand.picture;
+/// The mean of a channel around a position, and the patch's detail relative to its brightness.
+fn around(viewpoint: &Viewpoint, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
+    let p = &viewpoint.picture;
     let (x, y) = (u as usize, v as usize);
     if x < PATCH || y < PATCH || x + PATCH >= p.width || y + PATCH >= p.height {
         return None;
@@ -87,9 +87,9 @@ fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
     (mean > 0.0).then(|| (sums.map(|s| s / (side * side) as f64), fine / mean))
 }
 
-/// What two stands say of each other.
+/// Findings of a pair of camera positions.
 struct Pair {
-    stands: [usize; 2],
+    viewpoints: [usize; 2],
     matches: usize,
     /// Pixels of 1920, and own ones.
     off: [f64; 2],
@@ -100,14 +100,14 @@ struct Pair {
 }
 
 fn pair(
-    stands: &[(usize, &Stand)],
+    viewpoints: &[(usize, &Viewpoint)],
     sights: &[CameraView],
     [a, b]: [usize; 2],
     matches: &[([usize; 2], f32)],
 ) -> Option<Pair> {
     /// Values between which ratios of brightness mean something, of 255.
     const EXPOSED: [f64; 2] = [12.0, 240.0];
-    let (p, q) = (stands[a].1, stands[b].1);
+    let (p, q) = (viewpoints[a].1, viewpoints[b].1);
     let f = fundamental(&p.view, &q.view);
     let (mut off, mut gains, mut sharper) = (Vec::new(), [Vec::new(), Vec::new(), Vec::new()], Vec::new());
     for ([i, j], _) in matches {
@@ -128,7 +128,7 @@ fn pair(
     off.sort_by(f64::total_cmp);
     let own = QUARTILE_TO_MEDIAN * off[off.len() / 4];
     Some(Pair {
-        stands: [a, b],
+        viewpoints: [a, b],
         matches: off.len(),
         off: [own * 0.5 * (unit(&p.view) + unit(&q.view)), own],
         gain: gains.map(|mut g| if g.len() < MATCHES { f64::NAN } else { median(&mut g) }),
@@ -137,8 +137,8 @@ fn pair(
 }
 
 /// A number for each camera from pairwise differences, about the median of the cameras that are connected; None for
-/// those without a pair. Least squares, in which pairs of many features count more and those that contradict little (Cauchy's
-/// weights at `scale`).
+/// those without a pair. Least squares, in which pairs of many features count more and those that contradict little
+/// (Cauchy's weights at `scale`).
 fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<Option<f64>> {
     /// Of the weight of one feature: it only makes the equations of what nothing connects solvable.
     const RIDGE: f64 = 1e-9;
@@ -170,9 +170,10 @@ fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<
     (0..cameras).map(|c| told.iter().any(|(pair, ..)| pair.contains(&c)).then(|| values[c] - middle(c))).collect()
 }
 
-/// How far what a camera shows lies off, as those of its pairs say that are surest: pixels of 1920, and own ones.
-fn poses(pairs: &[Pair], stands: &[(usize, &Stand)], camera: usize) -> Option<(f64, f64)> {
-    let mut own: Vec<&Pair> = pairs.iter().filter(|p| p.stands.iter().any(|&k| stands[k].0 == camera)).collect();
+/// Error of a camera by its most reliable pairs: pixels of 1920, and own ones.
+fn poses(pairs: &[Pair], viewpoints: &[(usize, &Viewpoint)], camera: usize) -> Option<(f64, f64)> {
+    let mut own: Vec<&Pair> =
+        pairs.iter().filter(|p| p.viewpoints.iter().any(|&k| viewpoints[k].0 == camera)).collect();
     own.sort_by(|p, q| p.off[0].total_cmp(&q.off[0]));
     (own.len() >= TELL).then(|| (own[AGREE - 1].off[0], own[AGREE - 1].off[1]))
 }
@@ -184,14 +185,14 @@ pub(super) fn between(
     report: &mut Report,
     progress: &mut Progress<'_>,
 ) {
-    let stands: Vec<(usize, &Stand)> =
-        seen.iter().enumerate().flat_map(|(c, s)| s.stands.iter().map(move |stand| (c, stand))).collect();
-    progress.phase("features", 0, stands.len());
+    let viewpoints: Vec<(usize, &Viewpoint)> =
+        seen.iter().enumerate().flat_map(|(c, s)| s.viewpoints.iter().map(move |viewpoint| (c, viewpoint))).collect();
+    progress.phase("features", 0, viewpoints.len());
     let name = |c: usize| capture.cameras[c].name.as_str();
     let sights: Vec<CameraView> =
-        stands.par_iter().enumerate().map(|(k, (c, s))| sight(name(*c), k, s, options.features)).collect();
+        viewpoints.par_iter().enumerate().map(|(k, (c, s))| sight(name(*c), k, s, options.features)).collect();
     let found = links(&sights, Pairing::All, 0, progress);
-    let pairs: Vec<Pair> = found.iter().filter_map(|l| pair(&stands, &sights, l.sights, &l.matches)).collect();
+    let pairs: Vec<Pair> = found.iter().filter_map(|l| pair(&viewpoints, &sights, l.sights, &l.matches)).collect();
     if pairs.is_empty() {
         report
             .left
@@ -199,7 +200,7 @@ pub(super) fn between(
         return;
     }
     let told = |p: &Pair| PairReport {
-        cameras: p.stands.map(|k| name(stands[k].0).to_owned()),
+        cameras: p.viewpoints.map(|k| name(viewpoints[k].0).to_owned()),
         matches: p.matches,
         epipolar: p.off[0],
         gain: p.gain,
@@ -207,15 +208,15 @@ pub(super) fn between(
     };
     report.pairs = pairs.iter().map(told).collect();
     report.pairs.sort_by(|a, b| b.epipolar.total_cmp(&a.epipolar));
-    let rig = seen.iter().filter(|s| !s.stands.is_empty()).count();
+    let rig = seen.iter().filter(|s| !s.viewpoints.is_empty()).count();
     let by_camera = |value: &dyn Fn(&Pair) -> f64, scale: f64| {
-        let of = |p: &Pair| (p.stands.map(|k| stands[k].0), value(p), p.matches as f64);
+        let of = |p: &Pair| (p.viewpoints.map(|k| viewpoints[k].0), value(p), p.matches as f64);
         relative(seen.len(), &pairs.iter().map(of).collect::<Vec<_>>(), scale)
     };
     let gains = [0, 1, 2].map(|c| by_camera(&move |p| p.gain[c], STOPS));
     let sharper = by_camera(&|p| p.sharper, TIMES);
     for camera in 0..seen.len() {
-        let (off, own) = poses(&pairs, &stands, camera).unzip();
+        let (off, own) = poses(&pairs, &viewpoints, camera).unzip();
         let gain = [0, 1, 2].map(|c| gains[c][camera]);
         let sharp = sharper[camera].map(f64::exp);
         let row = &mut report.cameras[camera];
@@ -277,7 +278,7 @@ pub(super) fn between(
         }
     }
     let alone: Vec<&str> = (0..seen.len())
-        .filter(|&c| rig > 1 && report.cameras[c].epipolar.is_none() && !seen[c].stands.is_empty())
+        .filter(|&c| rig > 1 && report.cameras[c].epipolar.is_none() && !seen[c].viewpoints.is_empty())
         .map(name)
         .collect();
     if !alone.is_empty() {

@@ -1,6 +1,6 @@
-//! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other source
-//! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are chosen
-//! by eye.
+//! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other
+//! source is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are
+//! chosen by eye.
 
 use super::finding::{FindingList, grade};
 use super::look::CameraObservations;
@@ -14,9 +14,10 @@ use splat4d_train::vision::triangulate::angle_at;
 const ANGLE: [f64; 2] = [25.0, 45.0];
 /// Fewer cameras than the first are limited, than the second poor.
 const CAMERAS: [usize; 2] = [6, 4];
-/// Part of the space in which something moves that three cameras see; less than the first is a warning, than the second bad.
+/// Part of the space in which something moves that three cameras see; less than the first is a warning, than the second
+/// bad.
 const VOLUME: [f64; 2] = [0.8, 0.5];
-/// Part of the memory that training takes: the system and other programs want theirs, and what does not fit is swapped.
+/// Part of the memory that training takes: the system and other programs need theirs, and what does not fit is swapped.
 const MEMORY: [f64; 2] = [0.8, 1.0];
 /// Cameras with one fault become one finding from this part of all on.
 const MOST: f64 = 0.5;
@@ -33,7 +34,7 @@ pub(super) fn all(
         .map(|(c, s)| CameraReport {
             name: c.name.clone(),
             fixed: c.fixed,
-            picture: s.stands.first().map(|s| s.picture.clone()).unwrap_or_default(),
+            picture: s.viewpoints.first().map(|s| s.picture.clone()).unwrap_or_default(),
             ..CameraReport::default()
         })
         .collect();
@@ -43,7 +44,7 @@ pub(super) fn all(
         alone::alone(capture, camera, s, report);
     }
     take(capture, seen, report);
-    // Leaving out costs a view: only what no training mends, and only where enough are left.
+    // Leaving out loses a view: only for faults that training cannot correct, and only if enough are left.
     let gross = |f: &&Finding| f.grade == Grade::Bad && ["epipolar", "moved", "sharpness", "focus"].contains(&f.check);
     let mut out: Vec<String> = report.findings.iter().filter(gross).filter_map(|f| f.camera.clone()).collect();
     out.sort();
@@ -85,10 +86,10 @@ fn gather(report: &mut Report, cameras: usize) {
     }
 }
 
-/// What the whole rig states.
+/// Findings of the whole rig.
 fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let fixed: Vec<usize> =
-        (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
+        (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].viewpoints.is_empty()).collect();
     if fixed.len() < seen.len() {
         report.left.push(
             "Moving cameras: movement, flicker, frames and time offset are checked for fixed cameras only.".into(),
@@ -110,7 +111,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     if fixed.len() < 2 {
         return;
     }
-    let views: Vec<&Camera> = fixed.iter().map(|&c| &seen[c].stands[0].view).collect();
+    let views: Vec<&Camera> = fixed.iter().map(|&c| &seen[c].viewpoints[0].view).collect();
     let Some(target) = volume::target(&views) else {
         report.left.push(
             "Angles between cameras and what three of them see were not judged: the cameras have no common view."
@@ -124,7 +125,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
             others.map(|(_, o)| angle_at(target, view.center(), o.center()).to_degrees()).fold(f64::MAX, f64::min);
         if let Some(g) = grade(nearest, ANGLE) {
             let name = &capture.cameras[fixed[k]].name;
-            let what = format!("Camera {name} stands {nearest:.0}° from its nearest neighbour.");
+            let what = format!("Camera {name} is {nearest:.0}° from its nearest neighbour.");
             FindingList { report }.add(
                 (g.min(Grade::Warning), "angle"),
                 Some(name),
@@ -141,7 +142,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     volume_of(&own, target, report);
 }
 
-/// What three cameras see of dynamic regions about a place.
+/// Share of dynamic regions around a point that three cameras see.
 pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: &mut Report) {
     report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {
@@ -153,7 +154,7 @@ pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: 
     if let Some(g) = grade(1.0 / share.max(f64::MIN_POSITIVE), VOLUME.map(|v| 1.0 / v)) {
         let what = format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share);
         let words =
-            ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
+            ("Moving objects dissolve between the views.", "Turn the cameras to the action, or film with more.");
         FindingList { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);
     }
 }
@@ -175,7 +176,7 @@ pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
             (mega(needed) as f64, "MB"),
             what,
             (
-                "Training that crawls, or ends without a word.",
+                "Training that is slow, or ends without a message.",
                 "Train with --downscale 2, with fewer Gaussians (--set densify.max_cap), or a long take in chunks (--memory-limit).",
             ),
         );

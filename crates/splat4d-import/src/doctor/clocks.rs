@@ -13,8 +13,8 @@ use splat4d_train::event::Progress;
 
 /// Blur of dynamic regions by a wrong clock, pixels of 1920.
 const OFFSET: [f64; 2] = [0.5, 1.5];
-/// Standard deviations from which an offset is one, and the least part of a frame: of a hall whose cameras one clock drives up
-/// to 0.59 frames were found, other cameras with other settings, so that less than this is no evidence.
+/// Standard deviations from which an offset is one, and the least part of a frame: of a hall whose cameras one clock
+/// drives up to 0.59 frames were found, other cameras with other settings, so that less than this is no evidence.
 const OFFSET_SIGMAS: f64 = 4.0;
 const OFFSET_FRAMES: f64 = 0.75;
 /// Seconds from the first to the last row of an image, and standard deviations from which on they are believed.
@@ -22,8 +22,8 @@ pub(super) const SHUTTER: [f64; 2] = [0.004, 0.010];
 const SHUTTER_SIGMAS: f64 = 4.0;
 /// Neighbours with which a camera's clock is compared.
 const NEIGHBOURS: usize = 3;
-/// Frames that a clock is searched for within, and the part of those that were examined: right lags are recognized by standing out of
-/// many.
+/// Range of the search for a time offset, frames, and as a part of the examined ones: right lags are recognised as
+/// peaks among many.
 const WITHIN: f64 = 10.0;
 const WITHIN_PART: f64 = 1.0 / 3.0;
 
@@ -36,7 +36,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
         );
         return;
     }
-    let view = |c: usize| &seen[c].stands[0].view;
+    let view = |c: usize| &seen[c].viewpoints[0].view;
     let centers: Vec<_> = (0..seen.len()).map(|c| ready.contains(&c).then(|| view(c).center())).collect();
     let chosen = neighbours(&centers, NEIGHBOURS);
     progress.phase("comparing clocks", 0, chosen.len());
@@ -105,7 +105,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
                 Some(name),
                 (1e3 * off, "ms"),
                 what,
-                ("Moving things blurred or doubled.", &remedy),
+                ("Moving objects are blurred or doubled.", &remedy),
             );
         }
     }

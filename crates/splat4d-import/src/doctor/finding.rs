@@ -1,4 +1,4 @@
-//! What checks share: thresholds, grades, and the report that they write findings to.
+//! Shared parts of checks: thresholds, grades, and the report that they write findings to.
 
 use super::{Finding, Grade, Report};
 use splat4d::scene::Camera;
@@ -9,8 +9,8 @@ pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
 pub(super) const GAMMA: f64 = 2.2;
 /// Matches that are needed to judge a pair.
 pub(super) const MATCHES: usize = 12;
-/// So many of a camera's pairs must agree on its error at least, of so many that measure it; chance only makes errors
-/// larger.
+/// This many of a camera's pairs must agree on its error at least, of this many that measure it; chance only makes
+/// errors larger.
 pub(super) const AGREE: usize = 2;
 
 pub(super) fn grade(value: f64, [warning, bad]: [f64; 2]) -> Option<Grade> {
@@ -27,12 +27,12 @@ pub(super) fn worse([a, b]: [f64; 2], [c, d]: [f64; 2]) -> [f64; 2] {
 
 /// Pixels of an image 1920 wide for each of its own.
 pub(super) fn unit(view: &Camera) -> f64 {
-    /// The longer side of what thresholds are about.
+    /// The image's longer side that thresholds refer to.
     const WIDE: f64 = 1920.0;
     WIDE / view.width.max(view.height) as f64
 }
 
-/// Where findings go.
+/// Destination of findings.
 pub(super) struct FindingList<'a> {
     pub(super) report: &'a mut Report,
 }

@@ -1,4 +1,4 @@
-//! What is examined of a camera: a few images over the recording, and some in a row.
+//! Examined images of a camera: a few images over the recording, and some in a row.
 
 use super::Options;
 use crate::Result;
@@ -12,29 +12,29 @@ use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
 /// Images over the recording whose median is the static background.
 const SPREAD: usize = 15;
-/// From so many on a median knows the static background.
+/// From this many on a median gives the static background.
 const MEDIAN_FROM: usize = 3;
 /// Images of a moving camera that are compared with others.
 const STANDS: usize = 16;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
-/// Corners that must be found again before a camera is said to have moved.
+/// Corners that must be found again before a camera is declared to have moved.
 const CORNERS: usize = 12;
 /// Pixels along a side of the cells that motion is noted in.
 pub(super) const CELL: usize = 8;
 /// A cell moves from this part of its pixels on.
 const MOVING: f64 = 0.25;
 
-/// An image from a place: of the static background, or one of a moving camera.
-pub(super) struct Stand {
+/// An image from a position: of the static background, or one of a moving camera.
+pub(super) struct Viewpoint {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
 }
 
-/// What was seen of a camera.
+/// Measurements of a camera.
 #[derive(Default)]
 pub(super) struct CameraObservations {
-    pub(super) stands: Vec<Stand>,
+    pub(super) viewpoints: Vec<Viewpoint>,
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
     pub(super) clock: Clock,
@@ -61,8 +61,8 @@ fn halvings(view: &Camera) -> u32 {
     (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
 }
 
-/// The view of an image as it is examined.
-fn looked(view: &Camera) -> Camera {
+/// The view of an examined image.
+fn reduced(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }
 
@@ -71,7 +71,7 @@ fn bytes(color: &Planes<f32>) -> Rgb8 {
     small(Rgb8 { width: color.width, height: color.height, data }).0
 }
 
-/// Numbers evenly among so many, the first and last with them.
+/// Numbers evenly among this many, the first and last with them.
 fn spread(of: usize, count: usize) -> Vec<usize> {
     match of.min(count) {
         0 => Vec::new(),
@@ -168,7 +168,7 @@ fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
         let seen = ends[k].iter().map(|p| cells(&Grey::of(p), &still[k]));
         seen.reduce(|a, b| a.iter().zip(&b).map(|(a, b)| a | b).collect()).unwrap_or_default()
     });
-    // The cell of a place, and those around it, which its window reaches into.
+    // The cell of a position, and those around it, which its window reaches into.
     let rests = |k: usize, p: &[f64; 2]| {
         let [x, y] = p.map(|v| v.max(0.0) as usize / CELL);
         let down = restless[k].len() / across;
@@ -228,21 +228,21 @@ pub(super) fn camera(
             let still = Grey::of(&picture);
             seen.motion = pictures.iter().map(|p| cells(&Grey::of(p), &still)).collect();
         }
-        seen.stands.push(Stand { view: looked(&capture.frames[chosen[0]].view), picture });
+        seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[chosen[0]].view), picture });
     } else {
         for (&i, picture) in chosen.iter().zip(pictures) {
-            seen.stands.push(Stand { view: looked(&capture.frames[i].view), picture });
+            seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[i].view), picture });
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
     // Of a moving camera only the darkness is needed, for which a few images suffice.
     let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
-    let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
+    let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.viewpoints[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);
     let mut differences = Vec::new();
     let mut last: Option<Rgb8> = None;
     for (k, &i) in row.iter().enumerate() {
-        let picture = if fixed { load(i)? } else { seen.stands[k].picture.clone() };
+        let picture = if fixed { load(i)? } else { seen.viewpoints[k].picture.clone() };
         if let Some(last) = &last {
             differences.push((first + k, mean_difference(last, &picture)));
         }

@@ -49,7 +49,7 @@ pub struct Finding {
     pub unit: &'static str,
     /// The finding, a sentence.
     pub what: String,
-    /// What it will look like, a sentence; empty where that is said.
+    /// Its visible effect, a sentence; empty if it is stated already.
     pub looks: &'static str,
     /// The remedy, a sentence.
     pub remedy: String,
@@ -57,7 +57,7 @@ pub struct Finding {
     pub alike: Vec<Finding>,
 }
 
-/// What was measured of a camera, and an image of it.
+/// Measurements of a camera, and an image of it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CameraReport {
     /// Its name.
@@ -70,7 +70,7 @@ pub struct CameraReport {
     pub offset: Option<[f64; 2]>,
     /// Brightness relative to other cameras, stops: red, green, blue.
     pub exposure: Option<[f64; 3]>,
-    /// Sharpness relative to other cameras, at places that both see.
+    /// Sharpness relative to other cameras, at positions that both see.
     pub sharpness: Option<f64>,
     /// Pixels (of 1920) that the background moved between the first and the last images.
     pub moved: Option<f64>,
@@ -84,8 +84,8 @@ pub struct CameraReport {
 }
 
 impl CameraReport {
-    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a warning,
-    /// beyond the second bad. Of sharpness and focus, below.
+    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a
+    /// warning, beyond the second bad. Of sharpness and focus, below.
     pub fn limits(field: &str, view: &Camera) -> Option<[f64; 2]> {
         // Small images resolve less: their own pixels count.
         let or_pixels = |limits, pixels: [f64; 2]| finding::worse(limits, pixels.map(|p| p * finding::unit(view)));
@@ -100,7 +100,7 @@ impl CameraReport {
     }
 }
 
-/// What two cameras say of each other.
+/// Findings of a pair of cameras.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairReport {
     /// Their names.
@@ -115,7 +115,7 @@ pub struct PairReport {
     pub sharper: f64,
 }
 
-/// What training with all defaults takes.
+/// Cost of training with all defaults.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Training {
     /// The motion model that suits.
@@ -137,7 +137,7 @@ pub struct Report {
     pub pairs: Vec<PairReport>,
     /// Part of the space in which something moves that three cameras see.
     pub seen_by_three: Option<f64>,
-    /// What training takes with all defaults.
+    /// Cost of training with all defaults.
     pub training: Option<Training>,
     /// Cameras that should be left out.
     pub leave_out: Vec<String>,
@@ -145,7 +145,7 @@ pub struct Report {
     pub left: Vec<String>,
 }
 
-/// How closely to look.
+/// Level of detail.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// Consecutive images of a camera that are followed.
@@ -169,7 +169,7 @@ impl Default for Options {
 const STORE: usize = 64 << 20;
 
 /// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not report
-/// it (it is no Linux).
+/// it (it is not Linux).
 fn machine_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let all = text.lines().find_map(|l| l.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?;
@@ -178,7 +178,7 @@ fn machine_memory() -> Option<u64> {
     Some(container.map_or(all, |c: u64| c.min(all)))
 }
 
-/// Looks for everything that commonly spoils results.
+/// Checks for all common causes of bad results.
 ///
 /// Errors: a capture without images, images that cannot be read.
 pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>) -> Result<Report> {
@@ -208,7 +208,7 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
     }
     let mut seen = Vec::new();
     for camera in 0..capture.cameras.len() {
-        progress.phase("looking at cameras", camera, capture.cameras.len());
+        progress.phase("examining cameras", camera, capture.cameras.len());
         seen.push(look::camera(capture, &store, camera, options)?);
     }
     check::all(capture, &seen, options, &mut report, progress);

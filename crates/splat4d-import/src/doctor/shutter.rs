@@ -1,6 +1,5 @@
-//! Rolling shutters: a camera that reads its images row by row sees what is low in them later than what is high, and
-//! what
-//! moves leaves its epipolar line by as much.
+//! Rolling shutters: a camera that reads its images row by row captures the lower rows later than the upper ones, and
+//! what moves leaves its epipolar line by as much.
 
 use super::look::CameraObservations;
 use crate::sync::epipolar::{EpipolarLag, sampson};
@@ -36,11 +35,10 @@ struct Sighting {
 /// few
 /// tracks show. Shutters that all cameras share alike show less than their differences, which the deviation states.
 ///
-/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over
-/// the image,
-/// ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing sum to nothing, to first order. Least
-/// squares over all r and a correction of each lag; deviations by clusters of tracks (White 1980), for what is wrong with a track
-/// is wrong at all of its times.
+/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over the
+/// image, ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing
+/// sum to nothing, to first order. Least squares over all r and a correction of each lag; deviations by clusters of
+/// tracks (White 1980), for what is wrong with a track is wrong at all of its times.
 pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f64) -> Vec<Option<[f64; 2]>> {
     let clusters: Vec<(usize, Vec<Sighting>)> = (pairs.iter().enumerate())
         .flat_map(|(k, p)| p.found.matches.iter().map(move |m| (k, sightings(p, *m, seen, STEP * interval))))
@@ -90,7 +88,7 @@ pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f6
                 let column = factor.solve(one);
                 let of = |pull: &Vec<(usize, f64)>| pull.iter().map(|(k, v)| v * column[*k]).sum::<f64>().powi(2);
                 let told: f64 = pulls.iter().map(of).sum();
-                // And what the prior draws towards nothing.
+                // And the prior, which pulls towards zero.
                 let drawn: f64 = (0..all).map(|k| prior(k) * column[k] * column[k]).sum();
                 *deviation = (told + drawn).sqrt();
             }
@@ -103,7 +101,7 @@ pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f6
 fn sightings(pair: &Pair, [i, j]: [usize; 2], seen: &[CameraObservations], step: f64) -> Vec<Sighting> {
     let [a, b] = pair.cameras;
     let (one, other) = (&seen[a].tracks[i], &seen[b].tracks[j]);
-    let height = |c: usize| seen[c].stands[0].view.height as f64;
+    let height = |c: usize| seen[c].viewpoints[0].view.height as f64;
     let lag = pair.found.seconds;
     let of = |&(t, _): &(f64, [f64; 2])| {
         let x = one.smooth(t)?;

@@ -1,7 +1,8 @@
-//! Each fault drawn once, and a clean recording: a room of random spots that six cameras see, and balls that move in it.
+//! Each fault rendered once, and a clean recording: a room of random spots that six cameras see, and balls that move in
+//! it.
 
 use super::clocks::clocks;
-use super::look::{CameraObservations, Stand};
+use super::look::{CameraObservations, Viewpoint};
 use super::{CameraReport, Grade, Options, Report, check, examine, volume};
 use crate::sync::tracks::Track;
 use crate::video::Clock;
@@ -72,8 +73,9 @@ fn clean() -> &'static Clip {
     CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
 }
 
-/// What the doctor states of these images, where the ill camera's pose is turned by so many radians about its own x axis.
-fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
+/// What the doctor states of these images, where the ill camera's pose is turned by this many radians about its own x
+/// axis.
+fn report_of(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clip, turned, cameras);
     let options = Options { features: 500, ..Options::default() };
@@ -114,7 +116,7 @@ fn found(report: &Report, check: &str) -> Vec<String> {
 }
 
 fn is_found(clip: &Clip, check: &str) {
-    let report = says(clip, 0.0, CAMERAS);
+    let report = report_of(clip, 0.0, CAMERAS);
     assert_eq!(found(&report, check), [format!("c{ILL}")], "{check}: {:#?}", report.findings);
 }
 
@@ -150,7 +152,7 @@ fn blur(p: &mut Rgb8, reach: isize) {
 
 #[test]
 fn a_clean_capture_has_no_findings() {
-    let report = says(clean(), 0.0, CAMERAS);
+    let report = report_of(clean(), 0.0, CAMERAS);
     let bad: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
     assert!(bad.is_empty() && report.leave_out.is_empty(), "{bad:#?}");
     assert!(report.cameras.iter().all(|c| c.epipolar.is_some()), "all were compared: {:?}", report.left);
@@ -158,7 +160,7 @@ fn a_clean_capture_has_no_findings() {
 
 #[test]
 fn a_wrong_pose_is_found_and_left_out() {
-    let report = says(clean(), 0.02, CAMERAS);
+    let report = report_of(clean(), 0.02, CAMERAS);
     assert_eq!(found(&report, "epipolar"), ["c3"], "{:#?}", report.findings);
     assert_eq!(report.leave_out, ["c3"]);
 }
@@ -218,7 +220,7 @@ fn a_large_passing_object_is_not_reported_as_camera_motion() {
             picture.data[row + from * 3..row + to * 3].copy_from_slice(&body.data[row + from * 3..row + to * 3]);
         }
     }
-    let report = says(&clip, 0.0, CAMERAS);
+    let report = report_of(&clip, 0.0, CAMERAS);
     assert_eq!(found(&report, "moved"), [""; 0], "{:#?}", report.findings);
     assert!(report.cameras[ILL].moved.is_some(), "corners at the picture's side still tell");
 }
@@ -276,11 +278,11 @@ fn a_wrong_focal_length_and_swapped_cameras_are_found() {
     for f in ["fx", "fy"] {
         longer["cameras"][ILL][f] = json!(1.06 * sound["cameras"][ILL][f].as_f64().unwrap());
     }
-    assert_eq!(found(&says(&longer), "epipolar"), ["c3"]);
+    assert_eq!(found(&report_of(&longer), "epipolar"), ["c3"]);
     let mut swapped = sound.clone();
     swapped["cameras"][0]["images"] = sound["cameras"][4]["images"].clone();
     swapped["cameras"][4]["images"] = sound["cameras"][0]["images"].clone();
-    let report = says(&swapped);
+    let report = report_of(&swapped);
     let ill = found(&report, "epipolar");
     assert!(["c0", "c4"].iter().all(|c| ill.iter().any(|i| i == c)), "{:#?}", report.findings);
 }
@@ -327,14 +329,14 @@ fn seen_ball(view: Camera, place: [f64; 3]) -> CameraObservations {
         }
     }
     CameraObservations {
-        stands: vec![Stand { view, picture: Rgb8::default() }],
+        viewpoints: vec![Viewpoint { view, picture: Rgb8::default() }],
         motion: vec![cells; 2],
         ..CameraObservations::default()
     }
 }
 
 #[test]
-fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
+fn the_share_of_motion_seen_by_three_cameras_is_measured() {
     let place = [0.0, 0.0, 0.5];
     let away = |c: usize| {
         let mut view = camera(c);
@@ -358,7 +360,7 @@ fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
     assert_eq!(share(&still), None, "nothing moves");
 }
 
-/// Perfect tracks of things that move by one music, on a clock that is late by so many seconds, by a shutter that takes so
+/// Perfect tracks of objects with one motion, on a clock that is late by this many seconds, by a shutter that takes so
 /// long from the first to the last row.
 fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     let place = |k: usize, t: f64| {
@@ -384,7 +386,8 @@ fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
 }
 
-/// The findings on time offsets where the faulty camera is late by so many seconds, and reads its rows over so many.
+/// The findings on time offsets where the faulty camera is late by this many seconds, and reads its rows over this
+/// many.
 fn timed(late: f64, shutter: f64) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
@@ -392,7 +395,7 @@ fn timed(late: f64, shutter: f64) -> Report {
     let seen = |c: usize| {
         let own = |value: f64| if c == ILL { value } else { 0.0 };
         CameraObservations {
-            stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
+            viewpoints: vec![Viewpoint { view: camera(c), picture: Rgb8::default() }],
             tracks: tracks(c, own(late), own(shutter)),
             clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
             row: 60,
@@ -432,10 +435,10 @@ fn a_rolling_shutter_is_found() {
 
 #[test]
 fn few_cameras_one_camera_and_one_time_are_reported() {
-    assert_eq!(found(&says(clean(), 0.0, 3), "cameras").len(), 1);
-    assert_eq!(found(&says(clean(), 0.0, 1), "cameras").len(), 1);
+    assert_eq!(found(&report_of(clean(), 0.0, 3), "cameras").len(), 1);
+    assert_eq!(found(&report_of(clean(), 0.0, 1), "cameras").len(), 1);
     let moment: Clip = clean().iter().map(|c| c[..1].to_vec()).collect();
-    assert!(says(&moment, 0.0, CAMERAS).left.iter().any(|l| l.starts_with("Clocks")));
+    assert!(report_of(&moment, 0.0, CAMERAS).left.iter().any(|l| l.starts_with("Clocks")));
 }
 
 #[test]
@@ -459,7 +462,8 @@ fn training_that_does_not_fit_into_memory_is_reported() {
     assert_eq!(told(needed / 2), [Grade::Bad]);
 }
 
-/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the checks say.
+/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the
+/// checks state.
 #[test]
 fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();
@@ -488,10 +492,10 @@ fn invisible_faults_are_not_reported() {
         ("moved by 0.25 pixels", pushed),
     ];
     for (name, clip) in cases {
-        let report = says(&clip, 0.0, CAMERAS);
+        let report = report_of(&clip, 0.0, CAMERAS);
         let told: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
         assert!(told.is_empty(), "{name}: {told:#?}");
     }
     // A pose that is 0.05 degrees off: 0.2 of these pixels.
-    assert_eq!(found(&says(clean(), 0.0009, CAMERAS), "epipolar"), [""; 0]);
+    assert_eq!(found(&report_of(clean(), 0.0009, CAMERAS), "epipolar"), [""; 0]);
 }

@@ -7,16 +7,16 @@ use splat4d_train::vision::triangulate::{self, PixelObservation};
 
 /// Cells of the cube along each side.
 const SIDE: usize = 40;
-/// Half the cube's side, of the cameras' median distance from what they look at: it holds what stands half way to them.
+/// Half the cube's side, of the cameras' median distance from their target: it reaches half way to them.
 const HALF: f64 = 0.6;
-/// So many cameras bound a place, and so many give it a shape.
+/// This many cameras bound a position, and this many give it a shape.
 const SEES: [usize; 2] = [2, 3];
-/// Of the cameras that see a place so large a part must see something move there: noise and shade hide some of it.
+/// This share of the cameras that see a position must see something move there: noise and shade hide some of it.
 const MOVES: f64 = 0.75;
 /// Cells in all times that must move before a share means anything.
 const LEAST: usize = 60;
 
-/// Where so many cameras look, by their images' middles.
+/// Target of these cameras, from their image centres.
 pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
     let middle = |v: &&Camera| [0.5 * v.width as f64, 0.5 * v.height as f64];
     let sights: Vec<PixelObservation<'_>> =
@@ -27,7 +27,7 @@ pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
 /// Of the visual hull of dynamic regions (Laurentini 1994; frame by frame, as far as two cameras see it) the part that
 /// three see; None where too little moves.
 pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> Option<f64> {
-    let views: Vec<&Camera> = seen.iter().map(|s| &s.stands[0].view).collect();
+    let views: Vec<&Camera> = seen.iter().map(|s| &s.viewpoints[0].view).collect();
     let mut far: Vec<f64> = views.iter().map(|v| norm(sub(v.center(), target))).collect();
     let half = HALF * crate::sync::median(&mut far);
     let moments = seen.iter().map(|s| s.motion.len()).min().unwrap_or(0);
@@ -52,7 +52,7 @@ pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> O
     (known >= LEAST).then(|| shaped as f64 / known as f64)
 }
 
-/// The cell of a camera's image in which a place is seen.
+/// The cell of a camera's image in which a position is seen.
 fn cell_of(view: &Camera, place: [f64; 3]) -> Option<usize> {
     let ([u, v], _) = view.project(place)?;
     let inside = u >= 0.0 && v >= 0.0 && u < view.width as f64 && v < view.height as f64;

@@ -1,4 +1,4 @@
-//! What was found before, for a run that changes little: a value is found again by what it was made of.
+//! Stored results, for runs with small changes: a value is identified by its inputs.
 
 use crate::Result;
 use crate::video::fnv1a;
@@ -32,7 +32,8 @@ impl Cache {
 
     /// The value of this kind that was made of the same, else what `make` makes, which is kept.
     ///
-    /// Errors: those of `make`. What cannot be read is made again, and what cannot be written is made again the next time.
+    /// Errors: those of `make`. Unreadable values are computed again, and those that cannot be written are computed
+    /// again the next time.
     pub(super) fn or<T: Serialize + DeserializeOwned>(
         &self,
         kind: &str,
@@ -52,8 +53,8 @@ impl Cache {
         Ok(entry.value)
     }
 
-    /// Values of pairs: those that are known, and what `make` makes of the pairs that are not. A pair is known by the names of what
-    /// it is made of, whichever others there are.
+    /// Values of pairs: those that are known, and what `make` makes of the pairs that are not. A pair is known by the
+    /// names of what it is made of, whichever others there are.
     pub(super) fn pairs<T: Clone + Serialize + DeserializeOwned>(
         &self,
         kind: &str,

@@ -1,4 +1,4 @@
-//! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
+//! Time offsets of all cameras before poses are known: by sound, then by motion, then from their files.
 
 use super::cache::Cache;
 use super::poses::Solved;
@@ -13,14 +13,14 @@ use crate::{Error, ErrorKind, Result};
 use rayon::prelude::*;
 use splat4d_train::event::Progress;
 
-/// Metres between cameras as sound goes, where nothing is known of them: a room's; 15 ms.
+/// Assumed distance of cameras for sound, metres, if unknown: that of a room; 15 ms.
 pub(super) const WAY: f64 = 5.0;
 /// Least seconds that all cameras must film at once.
 const LEAST_SHARED: f64 = 0.1;
 /// Frames a second of cameras that do not state them.
 const USUAL_RATE: f64 = 30.0;
 
-/// All pairs of so many.
+/// All pairs of this many.
 fn pairs(n: usize) -> Vec<[usize; 2]> {
     (0..n).flat_map(|a| (a + 1..n).map(move |b| [a, b])).collect()
 }
@@ -74,7 +74,7 @@ fn heard(
     Ok(pairs.par_iter().map(of).collect())
 }
 
-/// What motion states.
+/// Evidence of motion.
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,
@@ -151,7 +151,7 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
     ))
     .remedy(
         "If one trigger drives all cameras, use --synchronous. Otherwise set offsets in import.toml (offset, \
-         keep_offset = true) and run the same command again: results so far are kept. Next time record sound and \
+         keep_offset = true) and run the same command again: existing results are kept. Next time record sound and \
          clap, or let two cameras at most 20 degrees apart see the same motion for a second.",
     ))
 }
@@ -182,14 +182,14 @@ fn seen(
     Ok(pairs.iter().map(of).collect())
 }
 
-/// Offsets of all cameras from what is known of pairs.
+/// Offsets of all cameras from the lags of pairs.
 pub(super) fn solve(cameras: &[Camera], evidence: &[Evidence], told: &[Option<f64>]) -> Solution {
     let rate = |c: &Camera| c.source.info().average_rate.or(c.source.info().nominal_rate).unwrap_or(USUAL_RATE);
     let slowest = cameras.iter().map(rate).fold(f64::INFINITY, f64::min);
     graph::solve(cameras.len(), evidence, told, 0.5 / slowest)
 }
 
-/// What of each camera is stored: of the chosen part, on the first camera's clock, what all cameras film.
+/// The stored part of each camera: the common time span of the chosen part, on the first camera's clock.
 pub(super) fn shared(
     cameras: &[Camera],
     clock: &Solution,
@@ -227,7 +227,7 @@ pub(super) fn shared(
     Ok(known.iter().map(cut).collect())
 }
 
-/// What was measured and not believed, a line each.
+/// Rejected measurements, a line each.
 pub(super) fn refusals(names: &[&str], evidence: &[Evidence], clock: &Solution) -> Vec<String> {
     let line = |r: &graph::Refused| {
         let e = &evidence[r.evidence];

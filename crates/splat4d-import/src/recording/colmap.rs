@@ -1,4 +1,4 @@
-//! Poses of fixed cameras by the COLMAP program, where it is installed: one image a camera, of the static background.
+//! Poses of fixed cameras by the COLMAP program, where it is installed: one image per camera, of the static background.
 
 use super::stored::Stored;
 use crate::calibration::{self, Calibration};
@@ -16,8 +16,8 @@ const PROGRAM: &str = "colmap";
 /// How to install what is missing.
 const INSTALL: &str = "Install it (apt install colmap, brew install colmap, or from colmap.github.io), or leave --colmap out: \
                        poses are found without it.";
-/// Between two looks at whether the program is done.
-const LOOK: Duration = Duration::from_millis(100);
+/// Interval between checks whether the program is done.
+const POLL: Duration = Duration::from_millis(100);
 /// Characters of the program's last words that are repeated.
 const LAST_WORDS: usize = 400;
 
@@ -29,7 +29,7 @@ struct Step {
     options: &'static [(&'static str, &'static str)],
 }
 
-/// What was measured to work best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain sizes).
+/// Options that worked best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain sizes).
 const STEPS: [Step; 3] = [
     Step {
         name: "feature_extractor",
@@ -62,11 +62,10 @@ const STEPS: [Step; 3] = [
     },
 ];
 
-/// Lenses and places of all cameras. The work is in `import/colmap` of the capture's folder, and is not done again
-/// where images
-/// and masks are the same.
+/// Lenses and positions of all cameras. The work is in `import/colmap` of the capture's folder, and is not done again
+/// where images and masks are the same.
 ///
-/// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` where `stop` said so.
+/// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` if `stop` requests it.
 pub(super) fn calibrate(
     stored: &Stored<'_>,
     progress: &mut Progress<'_>,
@@ -97,7 +96,7 @@ pub(super) fn calibrate(
     Ok(found)
 }
 
-/// What each step states that it knows. Errors: the program is not there.
+/// Options that each step supports. Errors: the program is not there.
 fn helps() -> Result<Vec<String>> {
     let help = |step: &Step| {
         let out = Command::new(PROGRAM).args([step.name, "--help"]).stdin(Stdio::null()).output();
@@ -164,9 +163,9 @@ fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> boo
             drop(child.kill());
             drop(child.wait());
             return Err(Error::new(ErrorKind::Interrupted, "stopped while COLMAP was at work")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL);
     };
     if status.success() { Ok(()) } else { Err(failed(step, &log, status)) }
 }

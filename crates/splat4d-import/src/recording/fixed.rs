@@ -1,4 +1,4 @@
-//! Whether a camera stood still while it recorded: such a recording shows no depth.
+//! Whether a camera did not move while it recorded: such a recording contains no depth.
 
 use crate::sync::grey::Grey;
 use crate::video::{EXAMINED, Frame, Selection, Source};
@@ -10,17 +10,19 @@ use splat4d_train::event::Progress;
 const SIDE: usize = 240;
 /// Examined frames, at least: two are alike by chance, or because a second one follows at once.
 const LEAST_FRAMES: usize = 3;
-/// Change of brightness from pixel to pixel, of 1, from which a pixel has texture: ten levels of 8 bits, several times codecs' noise.
+/// Change of brightness from pixel to pixel, of 1, from which a pixel has texture: ten levels of 8 bits, several times
+/// codecs' noise.
 const TEXTURE: f32 = 0.04;
 /// Pixels with texture, at least: fewer prove nothing.
 const LEAST_PIXELS: usize = 200;
 /// Displacement below which a pixel stays in place, pixels of [`SIDE`]: about one pixel of a 1080p recording.
 const IN_PLACE: f32 = 0.25;
-/// Part of the textured pixels that stay in place in every frame of a fixed camera: the rest is what moves in front of it.
+/// Part of the textured pixels that stay in place in every frame of a fixed camera: the rest is what moves in front of
+/// it.
 const BACKGROUND: f64 = 0.6;
 
-/// Whether one fixed camera recorded the selected part: most of its textured pixels stay in place in all examined frames.
-/// False where that cannot be decided. Errors: those of reading; `Interrupted`.
+/// Whether one fixed camera recorded the selected part: most of its textured pixels stay in place in all examined
+/// frames. False where that cannot be decided. Errors: those of reading; `Interrupted`.
 pub(crate) fn is_fixed(
     source: &dyn Source,
     selection: &Selection,
@@ -34,7 +36,7 @@ pub(crate) fn is_fixed(
         images.push(Grey::of(&frame.picture));
         progress.phase("checking that the camera moves", images.len(), EXAMINED);
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
     }
     Ok(stays(&images))
@@ -42,8 +44,8 @@ pub(crate) fn is_fixed(
 
 /// The same of grey images of one size.
 ///
-/// A displacement d changes the brightness of a pixel by its gradient times d. The gradient is that of the median image, which
-/// shows the background where something passes in front of it.
+/// A displacement d changes the brightness of a pixel by its gradient times d. The gradient is that of the median
+/// image, which shows the background where something passes in front of it.
 fn stays(images: &[Grey]) -> bool {
     let Some(first) = images.first().filter(|_| images.len() >= LEAST_FRAMES) else { return false };
     let (width, height) = (first.width, first.height);
@@ -78,7 +80,8 @@ mod tests {
     const WIDTH: usize = 160;
     const HEIGHT: usize = 120;
 
-    /// A wall of waves, displaced by `shift` pixels and brightened by `light`; a bright square at `square` hides part of it.
+    /// A wall of waves, displaced by `shift` pixels and brightened by `light`; a bright square at `square` hides part
+    /// of it.
     fn seen(k: usize, shift: f32, light: f32, square: Option<usize>) -> Grey {
         let rng = Rng::new(5, "wall", k as u64);
         let pixel = |i: usize| {

@@ -1,4 +1,4 @@
-//! Lags by motion, of cameras whose places are known: no feature needs to look alike from two sides.
+//! Lags by motion, of cameras with known poses: features need no match across viewpoints.
 
 use super::cache::Cache;
 use super::stored::Stored;
@@ -13,23 +13,24 @@ use splat4d_train::event::Progress;
 
 /// Frames in a row in which corners are followed.
 const WINDOW: usize = 90;
-/// Part of them that a clock is searched for within: right lags are recognized by standing out of many.
+/// Part of them for the search of a time offset: right lags are recognised as peaks among many.
 const WITHIN: f64 = 1.0 / 3.0;
-/// Corners of a camera that are followed, as the doctor has them.
+/// Corners of a camera that are followed, as in the doctor.
 const TRACKS: usize = 60;
-/// Frames that it takes: among fewer lags, a wrong one stands out as well (of 14 frames of the bundled capture, one was a frame off).
+/// Frames that it takes: among fewer lags, a wrong one can be a peak as well (of 14 frames of the bundled capture, one
+/// was a frame off).
 const SHORTEST: usize = 30;
 /// Neighbours that each camera is compared with.
 const NEIGHBOURS: usize = 3;
 
 /// A fixed camera, as a pinhole camera, and corners that move in it, by its own clock.
-struct StandingCamera {
+struct FixedCamera {
     camera: Camera,
     tracks: Vec<Track>,
     frames: usize,
 }
 
-/// Lags of neighbouring cameras. `clock` states about where to look.
+/// Lags of neighbouring cameras. `clock` gives the approximate lag.
 pub(super) fn by_geometry(
     stored: &Stored<'_>,
     clock: &Solution,
@@ -69,7 +70,7 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
     Ok(pairs.par_iter().filter_map(of).collect())
 }
 
-fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<StandingCamera>> {
+fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<FixedCamera>> {
     let Some((known, pose)) = stored.known(c).and_then(|k| Some((k, k.pose?))) else { return Ok(None) };
     let shots = &stored.pictures[c].shots;
     let count = shots.len();
@@ -96,5 +97,5 @@ fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<StandingC
         track.samples = track.samples.iter().map_while(|(t, p)| Some((*t, straight.pixel(*p)?))).collect();
     }
     tracks.retain(|t| !t.samples.is_empty());
-    Ok(Some(StandingCamera { camera: straight.camera(pose, size), tracks, frames: row }))
+    Ok(Some(FixedCamera { camera: straight.camera(pose, size), tracks, frames: row }))
 }

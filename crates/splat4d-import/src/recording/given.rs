@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 use splat4d_train::capture::{PointCloud, Rgb8};
 use std::path::Path;
 
-/// What was given of all cameras, in their order.
+/// Given values of all cameras, in their order.
 pub(super) struct Given {
     cameras: Vec<Calibrated>,
     /// Pixels across and down of the videos.
@@ -21,14 +21,14 @@ pub(super) struct Given {
     pub posed: bool,
     /// Whether its lengths are metres.
     pub metres: bool,
-    /// Points that came with it.
+    /// Its points.
     pub points: Option<PointCloud>,
 }
 
 impl Given {
     /// The calibration that a request names.
     ///
-    /// Errors: it cannot be read, names do not match, videos are of another shape, places of cameras that move.
+    /// Errors: it cannot be read, names do not match, videos are of another shape, positions of cameras that move.
     pub(super) fn read(request: &Request, cameras: &[Camera], moving: bool) -> Result<Option<Self>> {
         let Some(path) = &request.calibration else { return Ok(None) };
         let place = |e: Error| e.at(path.display());
@@ -72,11 +72,10 @@ impl Given {
 }
 
 /// Images of a camera in which bars are searched for.
-const LOOKS: usize = 3;
+const SAMPLED: usize = 3;
 
-/// What is known of every camera's stored images: by calibration, and by the user's own lens, which goes first.
-/// Sentences about
-/// calibrations that had to be corrected for them join the images' warnings.
+/// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority. Sentences
+/// about calibrations that had to be corrected for them join the images' warnings.
 pub(super) fn known(
     given: Option<&Given>,
     corrections: &Corrections,
@@ -111,11 +110,11 @@ pub(super) fn known(
 fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
     let count = pictures.shots.len();
     let look = |k: usize| {
-        let rgb = Rgb8::read(&folder.join(pictures.file((2 * k + 1) * count / (2 * LOOKS))))?;
+        let rgb = Rgb8::read(&folder.join(pictures.file((2 * k + 1) * count / (2 * SAMPLED))))?;
         let mut grey = Planes::new(1, rgb.height, rgb.width);
         let mean = |p: &[u8]| p.iter().map(|v| f32::from(*v)).sum::<f32>() / (3.0 * 255.0);
         grey.data.iter_mut().zip(rgb.data.chunks_exact(3)).for_each(|(v, p)| *v = mean(p));
         Ok(grey)
     };
-    (0..LOOKS).map(look).collect()
+    (0..SAMPLED).map(look).collect()
 }

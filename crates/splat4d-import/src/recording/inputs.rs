@@ -23,7 +23,7 @@ impl From<PathBuf> for Input {
 const VIDEOS: [&str; 14] =
     ["mp4", "mov", "m4v", "mkv", "avi", "webm", "mts", "m2ts", "ts", "mpg", "mpeg", "mxf", "3gp", "wmv"];
 
-/// The cameras that paths stand for: a video is one, or the chapters of a recording; a folder of images is one, and a
+/// The cameras that paths represent: a video is one, or the chapters of a recording; a folder of images is one, and a
 /// folder of those is all of them, by name. A folder with folders of videos has a camera in each.
 ///
 /// Errors: a path that is not there, a folder with neither, nothing at all.
@@ -107,7 +107,7 @@ fn recordings(files: Vec<PathBuf>) -> Vec<Input> {
     out
 }
 
-/// What is in a folder, by name; nothing hidden.
+/// Entries of a folder, by name, without hidden ones.
 fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     let read = std::fs::read_dir(folder).map_err(|e| Error::io("the folder cannot be read", e).at(folder.display()))?;
     let hidden = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));

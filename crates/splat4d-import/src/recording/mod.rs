@@ -1,6 +1,6 @@
 //! The whole import, from videos to a capture folder.
 //!
-//! Sound comes first because it needs no images. Then frames of the shared time span are stored, motion guesses the
+//! Sound is used first because it needs no images. Then frames of the shared time span are stored, motion guesses the
 //! offsets that sound leaves open, and offsets and poses are solved in turn until both converge. Results are stored in
 //! [`corrections::FILE`], where they can be corrected before the next run.
 
@@ -46,7 +46,7 @@ pub enum Rig {
     Moving,
 }
 
-/// What is to be imported, and how.
+/// Inputs and options of an import.
 #[derive(Clone, Debug)]
 pub struct Request {
     /// Videos, folders of images, and folders of those.
@@ -69,11 +69,11 @@ pub struct Request {
     pub apart: Option<([String; 2], f64)>,
     /// Tags that are in the images, for lengths and upwards.
     pub board: Option<Board>,
-    /// A camera and the metres that it stands above the floor.
+    /// A camera and its height above the floor, metres.
     pub camera_height: Option<(String, f64)>,
     /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
     pub calibration: Option<PathBuf>,
-    /// Whether the COLMAP program finds lenses and places.
+    /// Whether the COLMAP program finds lenses and positions.
     pub colmap: bool,
     /// A folder of masks; see `write::masks`.
     pub masks: Option<PathBuf>,
@@ -112,8 +112,8 @@ impl Request {
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
 const MOST_WALKING: usize = 150;
 
-/// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by
-/// structure from motion go by.
+/// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by structure
+/// from motion is keyed by.
 const PLACED_LEAST: f64 = 0.7;
 const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.
@@ -131,10 +131,10 @@ struct Camera {
     source: Box<dyn Source>,
 }
 
-/// Makes a capture. `stop` is asked between steps and between frames.
+/// Makes a capture. `stop` is called between steps and between frames.
 ///
 /// Errors: inputs that cannot be read, cameras that share no time, images that do not show one scene, no space; of kind
-/// `Interrupted` where `stop` said so. What was stored until then is kept, and the same request goes on from there.
+/// `Interrupted` if `stop` requested it. What was stored until then is kept, and the same request continues from there.
 pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Report> {
     request.selection.check()?;
     let folder = &request.folder;
@@ -187,7 +187,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     corrections.write(folder)?;
     if request.colmap && (moving || request.calibration.is_some()) {
         let why = if moving { "cameras move" } else { "a calibration is given" };
-        return Err(Error::input(format!("COLMAP is asked for poses, but {why}")).remedy(
+        return Err(Error::input(format!("COLMAP poses were requested, but {why}")).remedy(
             "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
         ));
     }
@@ -208,7 +208,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .zip(selections)
         .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
         .collect();
-    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
+    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue.");
     // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
     let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)
         .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
@@ -256,7 +256,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         if moving {
             poses::walking(&stored, MOST_WALKING, progress)
         } else {
-            poses::standing(&stored, clock, &told, progress, stop)
+            poses::fixed_cameras(&stored, clock, &told, progress, stop)
         }
     })?;
     if stop() {
@@ -285,7 +285,7 @@ fn names_of(pictures: &[Pictures]) -> Vec<&str> {
 /// Refuses what would only waste the time of training: most cameras, or frames of a moving one, must have been placed.
 fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> Result<()> {
     let (placed, asked) = if solved.moving {
-        let known = |s: &poses::Stand| s.poses.iter().flatten().count();
+        let known = |s: &poses::SolvedCamera| s.poses.iter().flatten().count();
         let asked: usize = pictures.iter().map(|p| p.shots.len()).sum();
         (solved.cameras.iter().flatten().map(known).sum(), asked.min(MOST_WALKING))
     } else {
@@ -374,8 +374,8 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
     Ok(())
 }
 
-/// Takes the way of sound out of clocks that sound alone determines, or reports why not.
-fn sound_goes(
+/// Removes the travel time of sound from clocks that sound alone determines, or reports why not.
+fn subtract_travel_time(
     solved: &mut poses::Solved,
     evidence: &[Evidence],
     told: &[Option<f64>],
@@ -416,12 +416,12 @@ fn crop(
     let Some(cropping) = request.crop else { return Ok(()) };
     for (k, (camera, selection)) in cameras.iter().zip(selections).enumerate() {
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
         selection.crop = match cropping {
             Cropping::At(crop) => Some(crop),
             Cropping::Auto => {
-                progress.phase("looking for black bars", k, cameras.len());
+                progress.phase("searching for black bars", k, cameras.len());
                 let found = video::without_bars(&*camera.source, selection);
                 found.map_err(|e| e.at(format!("camera {}", camera.name)))?
             }
@@ -437,7 +437,7 @@ fn crop(
     Ok(())
 }
 
-/// Opens all inputs; no file twice.
+/// Opens all inputs; without duplicates.
 fn open(request: &Request) -> Result<Vec<Camera>> {
     let inputs = find(&request.inputs)?;
     let mut sources = Vec::with_capacity(inputs.len());
@@ -482,7 +482,7 @@ fn finish(
         solved.take_points(&points);
         report.guesses.push("Points are the calibration's: too few were found in these images.".into());
     }
-    // What could not be placed is reported before what could not be measured.
+    // Unplaced cameras are reported before unmeasured ones.
     let metres = match world::settle(request, stored, origin, &mut solved, &mut report, progress) {
         Ok(metres) => metres,
         Err(e) => {
@@ -490,7 +490,7 @@ fn finish(
             return Err(e);
         }
     };
-    sound_goes(&mut solved, evidence, told, metres, pictures, &mut report);
+    subtract_travel_time(&mut solved, evidence, told, metres, pictures, &mut report);
     let mut placed = Vec::new();
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));

@@ -1,4 +1,4 @@
-//! Where the cameras are and when: clocks and poses need each other, and are solved in turn until both rest.
+//! Poses and time offsets of the cameras: each needs the other, so they are solved in turn until both converge.
 
 use super::cache::Cache;
 use super::stored::Stored;
@@ -13,23 +13,23 @@ use splat4d::scene::{Intrinsics, Lens};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::event::Progress;
 
-/// Rounds of clocks and poses at most. Of a hall whose clocks were up to four frames off, the worst was 0.3 frames off after
-/// three rounds, and no better after five (methods/16).
+/// Rounds of clocks and poses at most. Of a hall whose clocks were up to four frames off, the worst was 0.3 frames off
+/// after three rounds, and no better after five (methods/16).
 const ROUNDS: usize = 4;
 /// Clocks rest when the one that changed most changed by less, frames.
 const RESTED: f64 = 0.05;
-/// A clock is believed that so many moving points agree on.
+/// A clock is believed that this many moving points agree on.
 const MOVING_POINTS: usize = 20;
 /// The standard deviation of a clock that they agree on, frames: half of a hall's 31 clocks were 0.04 off.
 const BY_GEOMETRY: f64 = 0.06;
-/// Where sound determines a clock, geometry contradicts it from so many frames on.
+/// Difference in frames from which geometry contradicts a clock from sound.
 const CONTRADICTS: f64 = 1.0;
 /// Of points that are static training starts; where there are fewer, of all.
 const ENOUGH_STILL: usize = 200;
 
 /// A camera that could be placed.
 #[derive(Clone, Debug)]
-pub(super) struct Stand {
+pub(super) struct SolvedCamera {
     /// One, or one for every stored frame; none where it could not be placed.
     pub poses: Vec<Option<Se3>>,
     /// One pose for all frames.
@@ -42,10 +42,10 @@ pub(super) struct Stand {
     pub error: f64,
 }
 
-/// What was found.
+/// The result.
 pub(super) struct Solved {
     /// In the order of the stored cameras; why not, where one could not be placed.
-    pub cameras: Vec<Result<Stand, String>>,
+    pub cameras: Vec<Result<SolvedCamera, String>>,
     pub offsets: Vec<Option<Offset>>,
     pub points: Vec<([f64; 3], [u8; 3])>,
     pub up: [f64; 3],
@@ -56,7 +56,7 @@ pub(super) struct Solved {
     pub stray: Vec<bool>,
 }
 
-/// A solution as it is stored; of lenses that were given nothing.
+/// A stored solution; empty for given lenses.
 #[derive(Serialize, Deserialize)]
 struct Note {
     cameras: Vec<Result<Row, String>>,
@@ -75,7 +75,7 @@ struct Row {
     fixed: bool,
     /// fx fy cx cy.
     intrinsics: [f64; 4],
-    /// k1 to k6, p1, p2; what is found has no other terms.
+    /// k1 to k6, p1, p2; estimated lenses have no other terms.
     brown: Option<[f64; 8]>,
     sightings: usize,
     error: f64,
@@ -87,7 +87,7 @@ impl Note {
             let r = p.rotation.as_flattened();
             std::array::from_fn(|k| if k < 9 { r[k] } else { p.translation[k - 9] })
         };
-        let row = |s: &Stand| {
+        let row = |s: &SolvedCamera| {
             let Intrinsics { fx, fy, cx, cy } = s.intrinsics;
             let brown = match &s.lens {
                 Lens::Brown { k, p, .. } => Some([k[0], k[1], k[2], k[3], k[4], k[5], p[0], p[1]]),
@@ -127,7 +127,7 @@ impl Note {
                     s: [0.0; 4],
                 });
                 let given = stored.known(c);
-                Stand {
+                SolvedCamera {
                     poses: r.poses.into_iter().map(|p| p.map(pose)).collect(),
                     fixed: r.fixed,
                     intrinsics: given.map_or(Intrinsics { fx, fy, cx, cy }, |g| g.intrinsics),
@@ -149,7 +149,7 @@ impl Note {
     }
 }
 
-/// What was solved before of the same images, clocks and lenses, else what `solve` finds now.
+/// The stored solution for the same images, clocks and lenses, else that of `solve`.
 pub(super) fn once(
     cache: &Cache,
     stored: &Stored<'_>,
@@ -161,7 +161,7 @@ pub(super) fn once(
 }
 
 /// Places fixed cameras, and refines their clocks.
-pub(super) fn standing(
+pub(super) fn fixed_cameras(
     stored: &Stored<'_>,
     clock: graph::Solution,
     told: &[Option<f64>],
@@ -189,7 +189,7 @@ pub(super) fn standing(
         }
         let moved = refined(&solution, &mut current, &mut offsets, told, frame);
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
         if moved < RESTED * frame || round == ROUNDS {
             break;
@@ -217,7 +217,7 @@ pub(super) fn standing(
         taken.placed.clone().map(|p| {
             let (intrinsics, lens) = optics(stored, c, &p.lens);
             let poses = vec![Some(p.pose)];
-            Stand { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
+            SolvedCamera { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
         })
     };
     let cameras = (0..n).map(placed).collect();
@@ -284,14 +284,14 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
     // One device, one lens: its frames share it.
     let options = Options { walking: Some(most), ..Options::default() };
     let solution = sfm::solve(stored, &options, progress)?;
-    let mut cameras: Vec<Result<Stand, String>> =
+    let mut cameras: Vec<Result<SolvedCamera, String>> =
         stored.pictures.iter().map(|_| Err("no frame was placed".into())).collect();
     for taken in &solution.taken {
         let Ok(placed) = &taken.placed else { continue };
         let shots = stored.pictures[taken.camera].shots.len();
         let fresh = || {
             let (intrinsics, lens) = optics(stored, taken.camera, &placed.lens);
-            Stand { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
+            SolvedCamera { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
         };
         if cameras[taken.camera].is_err() {
             cameras[taken.camera] = Ok(fresh());
@@ -349,8 +349,8 @@ impl Solved {
     }
 }
 
-impl Stand {
-    /// As it is written.
+impl SolvedCamera {
+    /// As written.
     pub(super) fn written(&self, pictures: &Pictures, offset: Offset, masks: Option<Masks>) -> Placed {
         let poses = match &self.poses[..] {
             [Some(pose)] if self.fixed => Poses::Fixed(*pose),

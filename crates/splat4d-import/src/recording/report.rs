@@ -1,6 +1,6 @@
-//! What was found, and how sure it is.
+//! Results and their accuracy.
 
-use super::poses::Stand;
+use super::poses::SolvedCamera;
 use super::spacing::Gap;
 use crate::Result;
 use crate::sync::graph::Offset;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// The file in the capture's folder.
 const FILE: &str = "import/report.json";
 
-/// What an import found.
+/// Result of an import.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
     /// The capture's file.
@@ -24,7 +24,7 @@ pub struct Report {
     pub gaps: Vec<Gap>,
     /// Points that cameras agree on.
     pub points: usize,
-    /// What had to be assumed, a sentence each.
+    /// Assumptions, a sentence each.
     pub guesses: Vec<String>,
     /// Pairs of cameras whose lag was measured and contradicts the rest.
     pub refused: Vec<String>,
@@ -34,7 +34,7 @@ pub struct Report {
     pub still: bool,
 }
 
-/// What an import found of a camera.
+/// Result for a camera.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraReport {
     /// Its name.
@@ -51,11 +51,11 @@ pub struct CameraReport {
     pub offset: Option<f64>,
     /// Their standard deviation.
     pub sigma: Option<f64>,
-    /// What the offset is from.
+    /// Source of the offset.
     pub by: Vec<&'static str>,
     /// Why it could not be placed.
     pub trouble: Option<String>,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Median distance of points from where they are seen, pixels.
     pub error: Option<f64>,
@@ -63,12 +63,12 @@ pub struct CameraReport {
     pub focal: Option<f64>,
     /// Distance of its content from the position by the calibration, pixels; none: no calibration, or too few matches.
     pub calibration: Option<f64>,
-    /// What was odd about its file.
+    /// Remarks about its file.
     pub warnings: Vec<String>,
 }
 
 impl CameraReport {
-    pub(super) fn of(pictures: &Pictures, placed: &Result<Stand, String>, offset: Option<&Offset>) -> Self {
+    pub(super) fn of(pictures: &Pictures, placed: &Result<SolvedCamera, String>, offset: Option<&Offset>) -> Self {
         let stand = placed.as_ref().ok();
         Self {
             name: pictures.name.clone(),

@@ -7,7 +7,7 @@ use splat4d::math::se3::{dot, norm, sub};
 /// Largest angle between neighbours that features survive in most scenes, degrees (docs/filming.md).
 pub(super) const FAR: f64 = 20.0;
 
-/// Two neighbours on the way from camera to camera.
+/// Two neighbours along the rig.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Gap {
     /// Their names.
@@ -17,7 +17,7 @@ pub struct Gap {
 }
 
 impl Gap {
-    /// What to do about it; none: they are near enough.
+    /// Advice; none: they are near enough.
     pub(crate) fn advice(&self) -> Option<String> {
         let more = (self.degrees / FAR).ceil() as usize - 1;
         let [a, b] = &self.cameras;

@@ -1,4 +1,4 @@
-//! The stored images as structure from motion asks for them.
+//! The stored images as structure from motion requests them.
 
 use crate::sfm;
 use crate::sfm::lens::Known;
@@ -11,14 +11,14 @@ use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
 
-/// All cameras' stored images, and the clock of all as far as it is known.
+/// All cameras' stored images, and their time offsets as far as known.
 pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],
     pub offsets: Vec<Option<Offset>>,
-    /// Lenses, and places, that were given.
+    /// Lenses, and positions, that were given.
     pub known: &'a [Option<Known>],
-    /// What of images counts; empty: all of it.
+    /// Masks of images; empty: none.
     pub masks: &'a [Masks],
 }
 
@@ -37,12 +37,12 @@ impl<'a> Stored<'a> {
         Self { offsets: offsets.to_vec(), ..*self }
     }
 
-    /// What was given of a camera.
+    /// Given values of a camera.
     pub(super) fn known(&self, camera: usize) -> Option<Known> {
         self.known.get(camera).copied().flatten()
     }
 
-    /// Whether all places were given.
+    /// Whether all positions were given.
     pub(super) fn posed(&self) -> bool {
         !self.known.is_empty() && self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }

@@ -19,7 +19,7 @@ use splat4d_train::vision::triangulate::{PixelObservation, angle_at, triangulate
 const MOMENTS: usize = 12;
 /// A frame farther from a time than so much of an interval does not show it.
 const NEAR: f64 = 0.5;
-/// Degrees between two cameras that see a corner, at least: the placing of points goes by the same.
+/// Degrees between two cameras that see a corner, at least: as for the triangulation of points.
 const ANGLE: f64 = 1.5;
 /// Pixels of 1920 that a corner may be off its place.
 const OFF: f64 = 3.0;
@@ -55,7 +55,7 @@ impl TagWorld {
     }
 }
 
-/// A tag as a camera sees it.
+/// A tag in a camera's image.
 struct TagView {
     camera: Camera,
     tag: Tag,
@@ -69,7 +69,7 @@ struct Placed {
     corners: [[f64; 3]; 4],
 }
 
-/// Looks for a board's tags, and measures them.
+/// Searches for a board's tags, and measures them.
 ///
 /// Errors: images that cannot be read; no tags, or none that two cameras see; tags that contradict each other.
 pub(super) fn measured(
@@ -79,12 +79,12 @@ pub(super) fn measured(
     progress: &mut Progress<'_>,
 ) -> Result<TagWorld> {
     let clock = stored.on(&solved.offsets);
-    // What each look is: a camera, a frame, and the time that it belongs to.
+    // Each sample: a camera, a frame, and its time.
     let looks = if solved.moving { walked(&clock, solved) } else { stood(&clock, solved) };
     let mut seen: Vec<(usize, TagView)> = Vec::new();
     const AT_ONCE: usize = 8;
     for (k, some) in looks.chunks(AT_ONCE).enumerate() {
-        progress.phase("looking for tags", k * AT_ONCE, looks.len());
+        progress.phase("searching for tags", k * AT_ONCE, looks.len());
         let found: Vec<Vec<(usize, TagView)>> =
             some.par_iter().map(|look| look.tags(board, &clock, solved)).collect::<Result<_>>()?;
         seen.extend(found.into_iter().flatten());
@@ -111,7 +111,7 @@ struct TagImage {
     moment: usize,
 }
 
-/// Fixed cameras look at times that they share: the board may be carried about.
+/// Fixed cameras use shared times, because the board may be carried about.
 fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let cameras: Vec<usize> = (0..stored.cameras()).filter(|&c| solved.cameras[c].is_ok()).collect();
     let ends = |c: usize| (stored.time(c, 0), stored.time(c, stored.frames(c) - 1));
@@ -133,7 +133,7 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     out
 }
 
-/// Moving cameras look from everywhere at a board that stands.
+/// Moving cameras see a fixed board from all sides.
 fn walked(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let mut out = Vec::new();
     for (camera, stand) in solved.cameras.iter().enumerate() {

@@ -1,4 +1,5 @@
-//! The way of sound: once cameras have places in metres, what each heard too late is taken out of the clocks that only sound determines.
+//! Travel time of sound: once camera positions are known in metres, the delay of each is removed from clocks that only
+//! sound determines.
 
 use super::clocks::WAY;
 use super::poses::Solved;
@@ -7,16 +8,16 @@ use crate::sync::sound::{way, without_way};
 use splat4d::math::mat3;
 use splat4d::math::se3::{add, dot, norm, normalize, scale, sub};
 
-/// Of the cameras' distance from what they look at, the standard deviation of where sounds come from.
+/// Of the cameras' distance from their target, the standard deviation of the positions of sounds.
 const ABOUT: f64 = 0.3;
-/// Steps to where sounds come from; lags are nearly linear in it.
+/// Steps to the positions of sounds; lags are nearly linear in it.
 const STEPS: usize = 20;
 /// Standard deviations from which on a lag counts less (Huber).
 const OUTLIER: f64 = 2.0;
-/// A clock of geometry is sure to so many seconds at least.
+/// A clock of geometry is sure to this many seconds at least.
 const SURE: f64 = 1e-3;
 
-/// What was corrected.
+/// The correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Corrected {
     /// How many clocks.
@@ -25,10 +26,10 @@ pub(super) struct Corrected {
     pub most: f64,
 }
 
-/// Takes the way of sound out of clocks that sound alone determines. The solution's unit is the metre.
+/// Removes the travel time of sound from clocks that sound alone determines. The solution's unit is the metre.
 ///
-/// The positions of sounds come from cameras whose clocks geometry found or users gave: what these heard is late by
-/// nothing but its way. Of fewer cameras, or none, it is the middle of what all look at.
+/// The positions of sounds are estimated from cameras whose clocks geometry found or users gave: their sound is late by
+/// its travel time alone. With fewer cameras, or none, it is the common target of all.
 pub(super) fn corrected(
     solved: &mut Solved,
     evidence: &[Evidence],
@@ -103,7 +104,7 @@ fn own_sigma(e: &Evidence) -> f64 {
     (e.sigma.powi(2) - (0.5 * way(WAY)).powi(2)).max(SURE * SURE).sqrt()
 }
 
-/// The point that lies nearest to where all cameras look, and their median distance from it.
+/// The point nearest to the axes of all cameras, and their median distance from it.
 fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)> {
     let known: Vec<_> = places.iter().flatten().collect();
     let (mut a, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
@@ -122,24 +123,24 @@ fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)>
     distances.get(distances.len() / 2).map(|d| (middle, *d))
 }
 
-/// Where sounds come from.
+/// Positions of sounds.
 struct Source<'a> {
     places: &'a [Option<([f64; 3], [f64; 3])>],
-    /// What is believed before anything was heard, and its standard deviation.
+    /// Prior position of a sound, and its standard deviation.
     middle: [f64; 3],
     spread: f64,
 }
 
 impl Source<'_> {
-    /// How a lag changes with the place of the source, seconds a metre.
+    /// How a lag changes with the position of the source, seconds a metre.
     fn slope(&self, e: &Evidence, from: [f64; 3]) -> [f64; 3] {
         let to = |c: usize| normalize(sub(from, self.places[c].expect("it is placed").0));
         let [a, b] = e.cameras;
         sub(to(b), to(a)).map(way)
     }
 
-    /// The most likely place by lags of cameras whose clocks are known, and its standard deviation. (Gauss and Newton; differences
-    /// of times of arrival.)
+    /// The most likely position by lags of cameras whose clocks are known, and its standard deviation. (Gauss and
+    /// Newton; differences of times of arrival.)
     fn heard(&self, lags: &[&Evidence], clocks: &[Option<f64>]) -> ([f64; 3], f64) {
         let known: Vec<(&Evidence, f64)> = lags
             .iter()
@@ -182,7 +183,7 @@ impl Source<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::poses::Stand;
+    use super::super::poses::SolvedCamera;
     use super::*;
     use splat4d::math::Se3;
     use splat4d::scene::{Intrinsics, Lens};
@@ -209,7 +210,14 @@ mod tests {
         let stand = |c: usize| {
             let pose = Se3::look_at(place(c), [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]);
             let intrinsics = Intrinsics { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
-            Stand { poses: vec![Some(pose)], fixed: true, intrinsics, lens: Lens::Pinhole, sightings: 100, error: 0.3 }
+            SolvedCamera {
+                poses: vec![Some(pose)],
+                fixed: true,
+                intrinsics,
+                lens: Lens::Pinhole,
+                sightings: 100,
+                error: 0.3,
+            }
         };
         let offsets = heard
             .offsets

@@ -12,10 +12,10 @@ use splat4d_train::event::Progress;
 
 /// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
 const ALONG_AXIS: f64 = 0.966;
-/// Degrees between what floor and walls say and what cameras hold upwards that are reported.
-const TOLD: f64 = 1.0;
+/// Degrees between the up direction of floor and walls and that of the cameras from which on it is reported.
+const REPORTED: f64 = 1.0;
 
-/// Where the world is from.
+/// Source of the world's axes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Origin {
     /// A calibration, whose axes and lengths stay; whether these are metres.
@@ -26,7 +26,7 @@ pub(super) enum Origin {
 
 /// Gives a solution its unit and its axes, and states so in the report; whether the unit is the metre.
 ///
-/// Errors: what should give the scale is not visible, or contradicts itself.
+/// Errors: the reference of the scale is not visible, or contradicts itself.
 pub(super) fn settle(
     request: &Request,
     stored: &Stored<'_>,
@@ -49,8 +49,9 @@ pub(super) fn settle(
         let turned = turn(solved, up, true);
         let at = mat_vec(&turned.rotation, origin);
         solved.place(&Sim3 { translation: at.map(|v| -v), ..Sim3::default() });
-        let stands = if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "lies" } else { "hangs" };
-        report.guesses.push(format!("Upwards (+z) and the origin are the board's, as it {stands}."));
+        let place =
+            if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "on the floor" } else { "on the wall" };
+        report.guesses.push(format!("The up direction (+z) and the origin are those of the board {place}."));
     } else if let Origin::Calibrated { .. } = origin {
         match along_axis(solved.up) {
             Some((axis, name)) => {
@@ -64,7 +65,7 @@ pub(super) fn settle(
         let turned = turn(solved, held, false);
         let off = dot(turned.rotation[2], held).clamp(-1.0, 1.0).acos().to_degrees();
         report.guesses.push(match (turned.upright, turned.along) {
-            (true, _) if off > TOLD => format!(
+            (true, _) if off > REPORTED => format!(
                 "Upwards (+z) and the other axes are those of floor and walls; cameras were held {off:.0} degrees off."
             ),
             (true, _) => "Upwards (+z) and the other axes are those of floor and walls.".into(),
@@ -76,7 +77,7 @@ pub(super) fn settle(
         let by = metres / height(solved, stored, name)?;
         solved.place(&Sim3 { scale: by, ..Sim3::default() });
         report.guesses.push(format!(
-            "The unit of length is the metre: {name} stands {metres} m above the floor among the points. Tags or the \
+            "The unit of length is the metre: {name} is {metres} m above the floor among the points. Tags or the \
              distance of two cameras are more accurate."
         ));
     }
@@ -90,7 +91,7 @@ pub(super) fn settle(
     Ok(told || origin == Origin::Calibrated { metres: true })
 }
 
-/// Turns the world so that z is upwards and x and y are along walls, if there are any, with cameras looking along y.
+/// Rotates the world so that z is upwards and x and y are along walls, if there are any, with cameras looking along y.
 fn turn(solved: &mut Solved, up: [f64; 3], fixed: bool) -> Axes {
     let points: Vec<[f64; 3]> = solved.points.iter().map(|p| p.0).collect();
     let found = axes(&points, up, fixed);
@@ -110,14 +111,14 @@ fn turn(solved: &mut Solved, up: [f64; 3], fixed: bool) -> Axes {
     Axes { rotation, ..found }
 }
 
-/// A camera's only, or first known, place.
+/// A camera's only, or first known, position.
 fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
     let k = stored.pictures.iter().position(|p| p.name == name)?;
     let stand = solved.cameras[k].as_ref().ok()?;
     stand.poses.iter().flatten().next().map(|p: &Se3| p.inverse().translation)
 }
 
-/// What makes the distance of two cameras so many metres.
+/// Scale that gives two cameras this distance in metres.
 fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) -> Result<f64> {
     let other = |what: String| Error::input(what).remedy("Give the distance of two other cameras.");
     let (Some(a), Some(b)) = (place(solved, stored, &pair[0]), place(solved, stored, &pair[1])) else {
@@ -130,7 +131,7 @@ fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) 
     Ok(metres / now)
 }
 
-/// How high a camera stands above the floor, in the unit that is.
+/// How high a camera is above the floor, in the current unit.
 fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
     let other = |what: String| {
         Error::input(what)

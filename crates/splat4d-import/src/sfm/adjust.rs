@@ -1,11 +1,11 @@
 //! Bundle adjustment: poses, lenses, clocks and points together, so that points are seen where they were found.
 //!
-//! Levenberg-Marquardt with a robust loss; points are eliminated (Schur complement), so that what is solved has a few rows
-//! for each camera (Triggs et al. 2000, "Bundle adjustment – a modern synthesis").
+//! Levenberg-Marquardt with a robust loss; points are eliminated (Schur complement), so that the reduced system has a
+//! few rows for each camera (Triggs et al. 2000, "Bundle adjustment – a modern synthesis").
 //!
-//! A camera whose clock is late by τ saw at its frame what the others saw τ later. A feature that moves by v pixels a second
-//! therefore belongs at x + v·τ, and the residual of point X is e = π(X) − (x + v·τ): clocks are found by the same least
-//! squares as poses, and what moves helps poses.
+//! A camera whose clock is late by τ saw at its frame what the others saw τ later. A feature that moves by v pixels a
+//! second therefore belongs at x + v·τ, and the residual of point X is e = π(X) − (x + v·τ): clocks are found by the
+//! same least squares as poses, and what moves helps poses.
 
 use super::algebra::{orthonormal, rotation};
 use super::lens::Lens;
@@ -39,7 +39,7 @@ pub(crate) struct Sighting {
     pub velocity: [f64; 2],
 }
 
-/// Cameras, points, and who sees what where.
+/// Cameras, points, and the sightings.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bundle {
     /// The cameras.
@@ -52,7 +52,7 @@ pub(crate) struct Bundle {
     pub sightings: Vec<Sighting>,
 }
 
-/// What is adjusted in addition to points.
+/// Parameters in addition to points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Free {
     /// Poses.
@@ -70,7 +70,7 @@ pub(crate) struct Free {
 /// Standard deviations of what is known beforehand; infinite: nothing is.
 #[derive(Clone, Debug)]
 pub(crate) struct Priors {
-    /// Where each lens is expected.
+    /// Prior of each lens.
     pub lenses: Vec<Lens>,
     /// Of log f.
     pub focal: f64,
@@ -98,11 +98,11 @@ impl Priors {
 pub(crate) struct Settings {
     /// Distance beyond which a sighting hardly counts (Cauchy's loss), pixels; infinite: plain squares.
     pub scale: f64,
-    /// What is adjusted.
+    /// The parameters.
     pub free: Free,
     /// Lenses that are known exactly and stay, whatever is free; none where it is empty.
     pub exact: Vec<bool>,
-    /// What is known beforehand.
+    /// The priors.
     pub priors: Priors,
     /// Evaluations, at most.
     pub steps: usize,
@@ -110,7 +110,7 @@ pub(crate) struct Settings {
     pub gain: f64,
 }
 
-/// What came of it.
+/// The result.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Report {
     /// The loss before: Σ of half the robust squares, with priors.
@@ -194,7 +194,7 @@ impl Bundle {
     }
 }
 
-/// How far a lens is from what is known of it, and the weights of that.
+/// Deviation of a lens from its known values, and its weights.
 fn known(lens: &Lens, prior: &Lens, settings: &Settings) -> [(f64, f64); LENS] {
     let p = &settings.priors;
     let weight = |deviation: f64| deviation.powi(-2);
@@ -385,7 +385,7 @@ impl Normal {
             right.iter_mut().zip(b).for_each(|(x, y)| *x -= y);
         }
         for k in 0..n {
-            // What is held, and what no camera sees.
+            // Fixed points, and those that no camera sees.
             if held[k] || self.cameras[k * n + k] == 0.0 {
                 (0..k).for_each(|j| a[k * n + j] = 0.0);
                 (k + 1..n).for_each(|i| a[i * n + k] = 0.0);
@@ -415,7 +415,7 @@ fn invert(m: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
     Some([column(0)?, column(1)?, column(2)?])
 }
 
-/// Numbers that stay: what is not free, and what fixes where the world is, which way it looks and how large it is.
+/// Fixed numbers: those that are not free, and the gauge (position, orientation and scale of the world).
 struct Gauge {
     held: Vec<bool>,
 }
@@ -428,7 +428,7 @@ impl Gauge {
         if views > 0 {
             held[..POSE - 1].fill(true);
             let first = bundle.views[0].pose.inverse().translation;
-            // Where the first camera stands, as others see it: scaling moves them along this.
+            // The first camera's position relative to the others: scaling moves them along this.
             let apart = |v: usize| bundle.views[v].pose.apply(first);
             let size = |v: usize| apart(v).iter().map(|x| x * x).sum::<f64>();
             let far = (1..views).fold(0, |best, v| if size(v) > size(best) { v } else { best });
@@ -478,9 +478,10 @@ fn moved(bundle: &Bundle, cameras: &[f64], points: &[[f64; 3]], held: &[bool]) -
 
 /// Adjusts a bundle in place.
 ///
-/// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the world.
+/// The first view's pose stays, and one number of another's translation: they fix position, direction and size of the
+/// world.
 pub(crate) fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
-    assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings come in the order of their points");
+    assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings are ordered by their points");
     assert_eq!(settings.priors.lenses.len(), bundle.lenses.len(), "every lens has its prior");
     /// Marquardt's λ: where it starts, how it grows and shrinks, and where nothing helps any more.
     const START: f64 = 1e-4;
@@ -588,8 +589,8 @@ mod tests {
         Settings { scale: f64::INFINITY, free, exact: Vec::new(), priors: Priors::none(lenses), steps: 100, gain: 0.0 }
     }
 
-    /// Largest differences of rotations (radians) and of centres after the best similarity, of focal lengths (relative) and
-    /// of clocks from each other (seconds).
+    /// Largest differences of rotations (radians) and of centres after the best similarity, of focal lengths (relative)
+    /// and of clocks from each other (seconds).
     fn apart(a: &Bundle, b: &Bundle) -> [f64; 4] {
         let poses = |b: &Bundle| b.views.iter().map(|v| v.pose).collect::<Vec<_>>();
         let (from, to) = (poses(a), poses(b));
@@ -607,7 +608,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_slopes() {
+    fn derivatives_equal_finite_differences() {
         let bundle = disturbed(&ring(3, false), 0.01);
         let h = 1e-6;
         for s in bundle.sightings.iter().step_by(7) {
@@ -642,7 +643,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_sightings_give_everything_to_nine_digits() {
+    fn exact_sightings_are_solved_to_nine_digits() {
         for shared in [false, true] {
             let truth = ring(6, shared);
             let mut bundle = disturbed(&truth, 0.01);
@@ -656,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn another_world_gives_the_same_answer() {
+    fn the_result_does_not_depend_on_the_world_frame() {
         let truth = ring(5, false);
         let free = Free { tau: false, ..ALL };
         let mut noisy = truth.clone();

@@ -15,8 +15,8 @@ fn derivative(p: &[f64]) -> Vec<f64> {
     p.iter().enumerate().skip(1).map(|(k, c)| k as f64 * c).collect()
 }
 
-/// The real roots of a polynomial (lowest coefficient first), ascending. A root where the curve only touches zero may be
-/// missing or come twice.
+/// The real roots of a polynomial (lowest coefficient first), ascending. A root where the curve only touches zero may
+/// be missing or duplicate.
 ///
 /// Between two neighbouring extrema a polynomial has at most one root, and the extrema are the roots of the derivative.
 pub(crate) fn roots(p: &[f64]) -> Vec<f64> {
@@ -134,7 +134,7 @@ pub(crate) fn null_space(rows: &[[f64; 9]]) -> Vec<[f64; 9]> {
         v.iter_mut().zip(m).for_each(|(a, b)| *a -= along * b);
     };
     for k in 0..rows.len() {
-        // The longest of what is left comes first.
+        // The longest remaining one is first.
         let left = |v: &[f64; 9]| v[k..].iter().map(|x| x * x).sum::<f64>();
         let best = (k..rows.len()).fold(k, |b, i| if left(&turned[i]) > left(&turned[b]) { i } else { b });
         turned.swap(k, best);
@@ -171,7 +171,8 @@ fn eigen<const N: usize>(a: [[f64; N]; N]) -> ([f64; N], [[f64; N]; N]) {
     jacobi(a, SWEEPS, |x, [p, q]| x.abs() <= f64::EPSILON * (p.abs() * q.abs()).sqrt() || x.abs() < f64::MIN_POSITIVE)
 }
 
-/// Singular values of a 3x3 matrix, falling, with U and V (both of determinant +1; the last value may be negative for it).
+/// Singular values of a 3x3 matrix, falling, with U and V (both of determinant +1; the last value may be negative for
+/// it).
 pub(crate) fn svd(m: &Mat3) -> (Mat3, [f64; 3], Mat3) {
     let (values, vectors) = eigen(mat_mul(&transpose(m), m));
     let mut order = [0, 1, 2];

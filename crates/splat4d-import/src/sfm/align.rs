@@ -1,4 +1,4 @@
-//! The world of cameras that know nothing of it: which way is up in it, where walls and floor lie, and how long its unit is.
+//! The world of uncalibrated cameras: up direction, walls and floor, and unit of length.
 
 use super::algebra::Mat3;
 use rayon::prelude::*;
@@ -11,8 +11,8 @@ pub(crate) fn up_of(poses: &[Se3]) -> [f64; 3] {
     normalize(sum)
 }
 
-/// The median distance of the cameras from what they look at: of each, the median distance of the points that it sees. With it
-/// as the unit, a scene is of a size that is known, where no length is.
+/// The median distance of the cameras from their targets: of each, the median distance of the points that it sees. With
+/// it as the unit, a scene is of a size that is known, where no length is.
 pub(crate) fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
     let mut each: Vec<f64> = distances.iter_mut().filter_map(|d| median(d)).collect();
     median(&mut each)
@@ -29,16 +29,16 @@ pub struct Axes {
     pub along: bool,
 }
 
-/// Degrees that what cameras hold upwards may be off: hands and tripods look down on what they film.
+/// Largest error of the cameras' mean up direction, degrees: hands and tripods point downwards.
 const TILT: f64 = 16.0;
 /// Steps of the first search, degrees: tilt, heading.
 const COARSE: [f64; 2] = [4.0, 3.0];
 /// Steps of the last one, degrees; walls of matched points allow no finer ones.
 const FINE: f64 = 0.05;
-/// Width of a bin, of the points' median distance from their middle: of the bundled capture's 650 points widths from 0.01 to 0.04
-/// find the axes to 0.4 degrees.
+/// Width of a bin, of the points' median distance from their middle: of the bundled capture's 650 points widths from
+/// 0.01 to 0.04 find the axes to 0.4 degrees.
 const BIN: f64 = 0.03;
-/// Points farther from the middle than so many medians are left out.
+/// Points farther from the middle than this many medians are left out.
 const FAR: f64 = 3.0;
 /// Points that are examined, at most, evenly chosen.
 const MOST: usize = 3000;
@@ -46,15 +46,15 @@ const MOST: usize = 3000;
 const FEWEST: usize = 60;
 /// Degrees off an upright frame at which entropy must have grown by [`CLEAR`] in every direction.
 const PROBE: f64 = 12.0;
-/// Nats, of all three projections. Clouds without structure (normal, on a sphere; 600 to 5,000 points) grow by 0.04 at most, the
-/// bundled capture's by 0.5; by 0.04 and 0.3 over the mean of headings.
+/// Nats, of all three projections. Clouds without structure (normal, on a sphere; 600 to 5,000 points) grow by 0.04 at
+/// most, the bundled capture's by 0.5; by 0.04 and 0.3 over the mean of headings.
 const CLEAR: f64 = 0.15;
 
-/// The frame whose three projections of the points have the least entropy, near to `up`: points of walls and floor then fall
-/// together. With `fixed`, `up` stays as it is and the heading alone is searched for.
+/// The frame whose three projections of the points have the least entropy, near to `up`: points of walls and floor then
+/// fall together. With `fixed`, `up` is kept and the heading alone is searched for.
 ///
-/// (Entropy of projections as a measure of structure: Huber 1985, "Projection pursuit"; aligned with a room's axes in Coughlan
-/// and Yuille's "Manhattan world", 1999.)
+/// (Entropy of projections as a measure of structure: Huber 1985, "Projection pursuit"; aligned with a room's axes in
+/// Coughlan and Yuille's "Manhattan world", 1999.)
 pub fn axes(points: &[[f64; 3]], up: [f64; 3], fixed: bool) -> Axes {
     let level = about(up);
     let Some((points, bin)) = gathered(points) else {
@@ -179,11 +179,11 @@ fn entropy(points: &[[f64; 3]], frame: &Mat3, bin: f64) -> f64 {
     bins.iter().flatten().filter(|n| **n > 0.0).map(|n| -(n / count) * (n / count).ln()).sum()
 }
 
-/// How high a floor is along `up`: the lowest height at which many points lie, with hardly any below.
+/// How high a floor is along `up`: the lowest height with many points, and with hardly any below.
 ///
 /// None: no such height.
 pub(crate) fn floor(points: &[[f64; 3]], up: [f64; 3]) -> Option<f64> {
-    /// Of all points, what lies on a floor at least, and below it at most (wrong points).
+    /// Shares of all points: at least on a floor, and at most below it (outliers).
     const ON: f64 = 0.08;
     const BELOW: f64 = 0.05;
     let (_, bin) = gathered(points)?;
@@ -211,7 +211,7 @@ mod tests {
         assert!(up[2] > 0.5, "{up:?}");
     }
 
-    /// A floor, two walls and things about, in a world that is turned.
+    /// A floor, two walls and objects, in a rotated world.
     fn room(turn: &Mat3, noise: f64) -> Vec<[f64; 3]> {
         let rng = Rng::new(4, "room", 0);
         let at = |k: usize| {

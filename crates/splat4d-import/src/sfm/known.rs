@@ -1,4 +1,5 @@
-//! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found about them.
+//! Cameras of which the lens is known, or the lens and the position: features are straightened once, and the rest is
+//! found about them.
 
 use super::lens::{Known, Lens as Plain, unit};
 use super::mapper::{Ground, Mapped, Mapping};
@@ -11,7 +12,8 @@ use splat4d::scene::{Camera, Intrinsics};
 use splat4d_train::capture::Distortion;
 use splat4d_train::event::Progress;
 
-/// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of little use.
+/// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of
+/// little use.
 const WIDEST: f64 = 3.0;
 
 /// Takes pixels of images to those of the pinhole camera with its principal point in the middle.
@@ -41,7 +43,7 @@ impl Straight {
         self.to.pinhole(pose, width, height)
     }
 
-    /// Where the camera without distortion sees what is seen at a pixel; none where no ray leads there.
+    /// The undistorted position of a pixel; none where no ray leads there.
     pub(crate) fn pixel(&self, [u, v]: [f64; 2]) -> Option<[f64; 2]> {
         let k = &self.from;
         let ray = self.lens.undistort([(u - k.cx) / k.fx, (v - k.cy) / k.fy])?;
@@ -69,9 +71,9 @@ impl Straight {
 /// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and measure their
 /// errors.
 ///
-/// What moves is next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
-/// within wide
-/// bounds; then points of what is on the lines, which it is at any clock, so that they determine none.
+/// Moving objects are off their epipolar lines as long as time offsets are wrong: first, offsets are estimated from
+/// matches, within wide bounds; then points of what is on the lines, which it is at any clock, so that they determine
+/// none.
 pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;
@@ -109,19 +111,20 @@ pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progre
 
 /// Matches of the static background that a pair of cameras must have before it shows whether poses are right.
 const SURE: usize = 12;
-/// Cameras whose axes are farther apart see other sides of things: what seems alike there is chance, degrees.
+/// Cameras whose axes are farther apart see other sides of objects: matches there are chance, degrees.
 const APART: f64 = 70.0;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
-/// So many of a camera's pairs must agree on its error, where so many measure it: a neighbour may be the one that is
-/// wrong.
+/// This many of a camera's pairs must agree on its error, where this many measure it: a neighbour may be the one that
+/// is wrong.
 const AGREE: usize = 2;
 const TELL: usize = 3;
 
-/// How far what each camera shows is from where the given poses say, pixels of the files' images.
+/// Distance of each camera's features from their positions by the given poses, pixels of the files' images.
 ///
-/// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
-/// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.
+/// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile
+/// of a pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of
+/// its pairs.
 fn errors(sights: &[CameraView], links: &[Link]) -> Vec<Option<f64>> {
     let camera = |s: &CameraView| {
         let lens = Plain::plain(s.focal?, s.size[0], s.size[1]);
@@ -172,7 +175,7 @@ mod tests {
         Known { intrinsics: Intrinsics { fx: 500.0, fy: 510.0, cx: 330.0, cy: 228.0 }, lens, pose }
     }
 
-    /// Where the bent camera sees a place of its own axes.
+    /// Projection of a point in the distorted camera's axes.
     fn seen(k: &Known, p: [f64; 3]) -> [f64; 2] {
         let [x, y] = Distortion::new(k.lens).distort([p[0] / p[2], p[1] / p[2]]).unwrap();
         [k.intrinsics.fx * x + k.intrinsics.cx, k.intrinsics.fy * y + k.intrinsics.cy]

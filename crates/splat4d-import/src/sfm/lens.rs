@@ -1,4 +1,4 @@
-//! How a camera makes pixels of places: square pixels, one radial coefficient, a principal point.
+//! How a camera makes pixels of positions: square pixels, one radial coefficient, a principal point.
 
 use splat4d::math::Se3;
 use splat4d::math::se3::mat_vec;
@@ -17,7 +17,7 @@ pub(crate) fn unit(size: f64) -> f64 {
 
 /// Focal length, distortion and principal point of a camera.
 ///
-/// A place (x, y, z) in the camera's axes is seen at f·d·(x/z, y/z) + (cx, cy) with d = 1 + k1·(x² + y²)/z².
+/// A position (x, y, z) in the camera's axes is seen at f·d·(x/z, y/z) + (cx, cy) with d = 1 + k1·(x² + y²)/z².
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lens {
     /// f, pixels.
@@ -31,7 +31,7 @@ pub struct Lens {
 /// A pixel position and how it changes.
 pub(crate) struct LensProjection {
     pub pixel: [f64; 2],
-    /// With the place in the camera's axes.
+    /// With the position in the camera's axes.
     pub by_place: [[f64; 3]; 2],
     /// With log f and k1.
     pub by_lens: [[f64; 2]; 2],
@@ -43,7 +43,7 @@ impl Lens {
         Self { focal, k1: 0.0, center: [0.5 * width as f64, 0.5 * height as f64] }
     }
 
-    /// Where a place in the camera's axes is seen; nothing at or behind the camera.
+    /// Projection of a point in camera axes; none at or behind the camera.
     pub(crate) fn project(&self, p: [f64; 3]) -> Option<[f64; 2]> {
         if p[2] <= 0.0 || p[2].is_nan() {
             return None;
@@ -81,7 +81,7 @@ impl Lens {
         for _ in 0..STEPS {
             let slope = 1.0 + 3.0 * self.k1 * r * r;
             if slope <= 0.0 {
-                // Beyond where the model turns back no place is seen at all: as if it did not bend.
+                // Beyond where the model turns back no position is seen at all: as if it did not bend.
                 r = radius;
                 break;
             }
@@ -94,7 +94,7 @@ impl Lens {
         [bent[0] * r / radius, bent[1] * r / radius, 1.0]
     }
 
-    /// Where a pinhole camera of the same focal length would see what is seen at a pixel.
+    /// Undistorted position of a pixel, for a pinhole camera of the same focal length.
     pub(crate) fn straight(&self, pixel: [f64; 2]) -> [f64; 2] {
         let ray = self.ray(pixel);
         [self.focal * ray[0] + self.center[0], self.focal * ray[1] + self.center[1]]
@@ -119,14 +119,14 @@ impl Lens {
     }
 }
 
-/// Distance in pixels of where a place of the world is seen from where it should be; infinite behind the camera.
+/// Distance in pixels of where a position of the world is seen from where it should be; infinite behind the camera.
 pub(crate) fn off(lens: &Lens, pose: &Se3, x: [f64; 3], pixel: [f64; 2]) -> f64 {
     let p = mat_vec(&pose.rotation, x);
     let p = std::array::from_fn(|k| p[k] + pose.translation[k]);
     lens.project(p).map_or(f64::INFINITY, |[u, v]| (u - pixel[0]).hypot(v - pixel[1]))
 }
 
-/// What is known of a camera.
+/// Known values of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Known {
     /// Pixels of the files' images.
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_invert_projection_and_derivatives_are_slopes() {
+    fn rays_invert_projection_and_derivatives_equal_finite_differences() {
         let lens = Lens { focal: 430.0, k1: -0.12, center: [310.0, 190.0] };
         let p = [0.4, -0.3, 1.3];
         let seen = lens.project_by(p).unwrap();

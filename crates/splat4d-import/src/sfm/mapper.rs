@@ -1,4 +1,4 @@
-//! Cameras one after another: a pair to start with, then always the one that sees most of what is known.
+//! Cameras one after another: starts with a pair, then always adds the one that sees most known points.
 
 mod overlaid;
 mod strays;
@@ -38,10 +38,10 @@ pub struct Mapping {
 
 impl Default for Mapping {
     fn default() -> Self {
-        // Schönberger and Frahm 2016 (COLMAP) filter at 4 pixels and 1.5 degrees. The rest is measured: most sightings are exact to
-        // 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2; principal points kept within
-        // 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28 degrees, 0.43 with 1 %), and 1 % for the
-        // hall (0.73 degrees, 0.91 with 0.3 %).
+        // Schönberger and Frahm 2016 (COLMAP) filter at 4 pixels and 1.5 degrees. The rest is measured: most sightings
+        // are exact to 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2;
+        // principal points kept within 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28
+        // degrees, 0.43 with 1 %), and 1 % for the hall (0.73 degrees, 0.91 with 0.3 %).
         Self { seed: 0, starts: 6, clocks: true, tolerance: 4.0, angle: 1.5, center: 0.005, k1: 0.01, scale: 0.6 }
     }
 }
@@ -58,31 +58,32 @@ const SEES: usize = 15;
 const FITS: usize = 12;
 /// Of the known points that it sees, the share that must fit.
 const FITS_SHARE: f64 = 0.2;
-/// A camera is placed within so many tolerances: points and lenses are not final.
+/// A camera is placed within this many tolerances: points and lenses are not final.
 const PLACED_WITHIN: f64 = 2.0;
 /// Views from which on focal lengths are adjusted, and from which on all else is: few views do not separate them from
 /// poses.
 const FOCAL_FROM: usize = 3;
 const ALL_FROM: usize = 7;
-/// Small rigs have no more: then from all of them, and at least so many.
+/// Small rigs have no more: then from all of them, and at least this many.
 const FEWEST: usize = 4;
-/// Everything is adjusted again once there are so many times as many views.
+/// Everything is adjusted again once there are this many times as many views.
 const GROWTH: f64 = 1.08;
-/// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the larger side; of
-/// clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
+/// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the
+/// larger side; of clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
 const GUESSED: f64 = 0.3;
-const TOLD: f64 = 0.1;
+const GIVEN: f64 = 0.1;
 const CLOCK: f64 = 2.0;
 /// Epipolar distance of matches that are searched for once cameras are placed, of the tolerance.
 const GUIDED_WITHIN: f64 = 0.5;
-/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from so many on; they then
-/// differ by this share (standard deviation). Of two phones of one model focal lengths differ by some tenths of a per cent.
+/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from this many
+/// on; they then differ by this share (standard deviation). Of two phones of one model focal lengths differ by some
+/// tenths of a per cent.
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
-/// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
+/// Difference of lenses that images contradict, as a share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
-/// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more contradicts it.
+/// Twice the loss of treating lenses as equal, of the variance of a sighting and for each lens: more contradicts it.
 /// Were sightings' errors independent, 1 would be usual (Wilks 1938).
 const CONTRADICTS: f64 = 8.0;
 /// Rounds of adjusting, leaving out and finding again at the end.
@@ -92,19 +93,19 @@ const ROUNDS: usize = 4;
 #[derive(Clone, Debug)]
 struct Spot {
     place: [f64; 3],
-    /// Which of its track's sights see it there.
+    /// The sights of its track that see it there.
     seen: Vec<usize>,
 }
 
-/// What is known so far.
+/// The present state of the map.
 #[derive(Clone)]
 pub(crate) struct Map<'a> {
     sights: &'a [CameraView],
     tracks: &'a [Track],
-    /// For each sight its tracks and its place in them.
+    /// For each sight its tracks and its index in them.
     shows: &'a [Vec<(usize, usize)>],
     how: &'a Mapping,
-    /// Placed sights in the order in which they were.
+    /// Placed sights in the order of placement.
     order: Vec<usize>,
     poses: Vec<Option<Se3>>,
     taus: Vec<f64>,
@@ -118,11 +119,11 @@ pub(crate) struct Map<'a> {
     spots: Vec<Option<Spot>>,
     /// Why sights could not be placed.
     reasons: Vec<String>,
-    /// Lenses that look alike were found not to be of one model.
+    /// Lenses with similar values were found to be of different models.
     strangers: bool,
 }
 
-/// What all starts share.
+/// Shared data of all starts.
 pub(crate) struct Ground<'a> {
     pub sights: &'a [CameraView],
     pub tracks: &'a [Track],
@@ -179,7 +180,7 @@ impl<'a> Ground<'a> {
         link.matches.iter().map(|&([i, j], _)| [ray(a, focal[0], i), ray(b, focal[1], j)]).collect()
     }
 
-    /// The map of no camera, with focal lengths (of the larger side) as they are given or guessed.
+    /// The map of no camera, with focal lengths (of the larger side) as given or guessed.
     fn empty(&self, focal: f64) -> Map<'_> {
         let mut lenses: Vec<Option<Lens>> = vec![None; self.lens_count];
         let mut told = vec![false; self.lens_count];
@@ -224,7 +225,7 @@ impl<'a> Ground<'a> {
         map
     }
 
-    /// The map of cameras that stand where they are said to, with the clocks that were found before.
+    /// The map of cameras at their stated positions, with the clocks that were found before.
     pub(super) fn given(&self, before: Option<&Mapped>) -> Map<'_> {
         let mut map = self.empty(1.0);
         map.order = (0..self.sights.len()).collect();
@@ -235,7 +236,7 @@ impl<'a> Ground<'a> {
         map
     }
 
-    /// The map of cameras as another one has them.
+    /// The map of cameras from another map.
     fn again(&self, from: &Map<'_>) -> Map<'_> {
         let mut map = self.empty(1.0);
         map.order.clone_from(&from.order);
@@ -263,17 +264,17 @@ impl Map<'_> {
         &self.lenses[self.lens_of[sight]]
     }
 
-    /// Where a sight saw a track's place, by the clock that all share.
+    /// The sighting of a track in a sight, at the common time.
     fn pixel(&self, track: usize, k: usize) -> [f64; 2] {
         let (sight, feature) = self.tracks[track].seen[k];
         let f = &self.sights[sight].features[feature];
         std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[sight])
     }
 
-    /// How far from there a place is seen, of the tolerance.
+    /// How far from there a position is seen, of the tolerance.
     fn off(&self, track: usize, k: usize, x: [f64; 3]) -> f64 {
         let sight = self.tracks[track].seen[k].0;
-        let pose = self.poses[sight].as_ref().expect("only placed sights are asked");
+        let pose = self.poses[sight].as_ref().expect("only placed sights are queried");
         off(self.lens(sight), pose, x, self.pixel(track, k)) / self.tolerance(sight)
     }
 
@@ -283,19 +284,19 @@ impl Map<'_> {
     }
 
     fn center(&self, sight: usize) -> [f64; 3] {
-        self.poses[sight].as_ref().expect("only placed sights are asked").inverse().translation
+        self.poses[sight].as_ref().expect("only placed sights are queried").inverse().translation
     }
 
-    /// The largest angle between the rays of these sights of a track at a place, degrees.
+    /// The largest angle between the rays of these sights of a track at a point, degrees.
     fn angle(&self, track: usize, seen: &[usize], x: [f64; 3]) -> f64 {
         let centers: Vec<[f64; 3]> = seen.iter().map(|&k| self.center(self.tracks[track].seen[k].0)).collect();
         let pairs = (0..centers.len()).flat_map(|i| (0..i).map(move |j| (i, j)));
         pairs.map(|(i, j)| angle_at(x, centers[i], centers[j])).fold(0.0, f64::max).to_degrees()
     }
 
-    /// The place of a track that most of its placed sights agree with.
+    /// The position of a track that most of its placed sights agree with.
     fn triangulated(&self, track: usize, cameras: &[Option<Camera>]) -> Option<Spot> {
-        /// Pairs of sights that places are tried of, at most.
+        /// Pairs of sights for trial positions, at most.
         const PAIRS: usize = 40;
         let placed = self.placed(track);
         if placed.len() < 2 {
@@ -338,7 +339,7 @@ impl Map<'_> {
         (0..self.sights.len()).map(of).collect()
     }
 
-    /// Leaves out what does not fit, takes in what fits, and finds places for tracks that have none.
+    /// Leaves out what does not fit, takes in what fits, and finds positions for tracks that have none.
     pub(super) fn renew(&mut self) {
         let cameras = self.cameras();
         let next = |t: usize| -> Option<Spot> {
@@ -374,7 +375,7 @@ impl Map<'_> {
         self.sights.iter().all(|s| s.pose.is_some())
     }
 
-    /// Adjusts everything with so many evaluations; the loss and how many sightings it is of.
+    /// Adjusts everything with this many evaluations; the loss and how many sightings it is of.
     fn adjust(&mut self, steps: usize) -> Option<(f64, usize)> {
         let mut bundle = Bundle::default();
         let mut number = vec![usize::MAX; self.sights.len()];
@@ -420,7 +421,7 @@ impl Map<'_> {
             exact: lens_back.iter().map(|&l| self.exact[l]).collect(),
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
-                focal: if told { TOLD } else { GUESSED },
+                focal: if told { GIVEN } else { GUESSED },
                 family: match family {
                     true if self.strangers => STRANGERS,
                     true => FAMILY,
@@ -463,8 +464,8 @@ impl Map<'_> {
         2.0 * (alike - strangers) > CONTRADICTS * variance * lenses.len() as f64
     }
 
-    /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them is then the
-    /// error of each. Of too few, or of images of several sizes, it is not asked.
+    /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them
+    /// is then the error of each. It is skipped for too few, or for images of several sizes.
     fn family(&self, lenses: &[usize]) -> bool {
         if lenses.len() < FAMILY_FROM || self.order.len() < ALL_FROM {
             return false;
@@ -536,7 +537,7 @@ impl Map<'_> {
         true
     }
 
-    /// Places as many sights as can be.
+    /// Places as many sights as possible.
     pub(crate) fn grow(&mut self, tell: &mut dyn FnMut(usize)) {
         const STEPS: usize = 10;
         let mut adjusted = self.order.len() as f64;
@@ -567,7 +568,7 @@ impl Map<'_> {
         }
     }
 
-    /// Adjusts, leaves out and finds again; all sights stay.
+    /// Adjusts, removes outliers and matches again; all sights stay.
     pub(super) fn settle(&mut self) {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
@@ -576,7 +577,7 @@ impl Map<'_> {
         }
     }
 
-    /// Adjusts, leaves out, finds again until it rests; sights that are left with too little are taken out.
+    /// Adjusts, removes outliers and matches again until convergence; sights with too few points are removed.
     pub(crate) fn finish(&mut self) {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
@@ -598,7 +599,7 @@ impl Map<'_> {
     }
 
     /// A placed camera without distortion, and where it saw its features by the clock that all share.
-    fn stands(&self, sight: usize) -> Option<tracks::Known> {
+    fn undistorted(&self, sight: usize) -> Option<tracks::Known> {
         let [w, h] = self.sights[sight].size;
         let camera = self.lens(sight).pinhole(self.poses[sight]?, w, h);
         let straight = |f: &Feature| {
@@ -610,7 +611,7 @@ impl Map<'_> {
     /// Matches of placed cameras along epipolar lines, and those of `links` that are on them.
     pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
         let known: Vec<Option<tracks::Known>> =
-            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
+            (0..self.sights.len()).into_par_iter().map(|s| self.undistorted(s)).collect();
         let mut out = tracks::guided(self.sights, &known, GUIDED_WITHIN * self.how.tolerance, progress);
         for link in links {
             let [a, b] = link.sights;
@@ -628,7 +629,7 @@ impl Map<'_> {
         out
     }
 
-    /// Points that a sight sees where they are.
+    /// Points that a sight sees consistently.
     fn fits(&self, sight: usize) -> usize {
         let of = |&&(t, k): &&(usize, usize)| self.spots[t].as_ref().is_some_and(|s| s.seen.contains(&k));
         self.shows[sight].iter().filter(of).count()
@@ -664,7 +665,7 @@ impl Map<'_> {
             if v.is_empty() { 0.0 } else { *v.select_nth_unstable_by(at, f64::total_cmp).1 }
         };
         let of = |s: usize| match self.poses[s] {
-            Some(pose) => Ok(Stand {
+            Some(pose) => Ok(PlacedCamera {
                 pose,
                 lens: *self.lens(s),
                 tau: self.taus[s],
@@ -695,14 +696,14 @@ impl Map<'_> {
 
 /// A placed camera.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Stand {
+pub(crate) struct PlacedCamera {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
     /// Of images of the sight's size.
     pub lens: Lens,
     /// How far its clock is ahead, seconds.
     pub tau: f64,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Their median distance from where they are seen, pixels of the sight's size.
     pub error: f64,
@@ -727,7 +728,7 @@ pub(crate) struct MapPoint {
 #[derive(Clone, Debug)]
 pub(crate) struct Mapped {
     /// One for each sight.
-    pub cameras: Vec<Result<Stand, String>>,
+    pub cameras: Vec<Result<PlacedCamera, String>>,
     /// In the order of tracks.
     pub points: Vec<MapPoint>,
     /// Of cameras whose poses were given; see [`super::Solution::contradiction`].

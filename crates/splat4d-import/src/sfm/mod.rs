@@ -1,7 +1,7 @@
 //! Structure from motion: poses, lenses, time offsets and points of images without any.
 //!
 //! A fixed camera is one image: the features of its median background, and the features of moving objects at some
-//! shared times. Moving objects are evidence where walls look alike. Each of their features has a velocity, so time
+//! shared times. Moving objects are evidence where walls are ambiguous. Each of their features has a velocity, so time
 //! offsets are found together with poses (`adjust`). Each frame of a moving camera is an image.
 
 pub mod adjust;
@@ -27,20 +27,20 @@ use splat4d_train::event::Progress;
 use tracks::Pairing;
 
 /// A camera, and the frame of a moving one.
-type Who = (usize, Option<usize>);
+type CameraFrame = (usize, Option<usize>);
 
 /// How poses are found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Options {
-    /// What features are taken from.
+    /// Source of features.
     pub look: FeatureOptions,
     /// How cameras are placed.
     pub mapping: Mapping,
-    /// Whether cameras move: then every frame is placed on its own, at most so many of them.
+    /// Whether cameras move: then every frame is placed on its own, at most this many of them.
     pub walking: Option<usize>,
 }
 
-/// Where an image was taken from: a fixed camera's, or one frame's of a moving one.
+/// Pose of an image: a fixed camera's, or one frame's of a moving one.
 #[derive(Clone, Debug)]
 pub struct Taken {
     /// The camera.
@@ -49,11 +49,11 @@ pub struct Taken {
     pub frame: Option<usize>,
     /// Its name in messages.
     pub name: String,
-    /// Where it is; why not, where it could not be found.
+    /// Its pose, or the reason for none.
     pub placed: Result<Placed, String>,
 }
 
-/// Where a camera stands.
+/// Pose of a camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Placed {
     /// Takes world points into the camera's axes.
@@ -64,7 +64,7 @@ pub struct Placed {
     pub size: [usize; 2],
     /// How far its clock is ahead, seconds: to be taken from its times. Only differences between cameras mean anything.
     pub tau: f64,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Their median distance from where they are seen, pixels of the files' images.
     pub error: f64,
@@ -90,14 +90,14 @@ pub struct Point {
 pub struct Solution {
     /// One for each camera, or for each frame that was chosen of moving ones.
     pub taken: Vec<Taken>,
-    /// What they see.
+    /// Their points.
     pub points: Vec<Point>,
     /// Upwards in the world, guessed: what most cameras hold upwards (unit).
     pub up: [f64; 3],
     /// Pairs of images that were found to show one scene.
     pub pairs: usize,
-    /// For each camera whose place was known, how far what it shows is from where that states: epipolar distance of matches that
-    /// were found without it, at the median, pixels of the files' images. None: too few matches.
+    /// For each camera with a known pose, the deviation from it: epipolar distance of matches that were found without
+    /// it, at the median, pixels of the files' images. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
@@ -108,12 +108,12 @@ pub struct Solution {
 /// Finds where images were taken from.
 ///
 /// The world's unit is the median distance of the cameras from the points; its axes are those of the camera that was
-/// placed first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes:
-/// then only points and clocks are found.
+/// placed first. Scale and the vertical need other sources. If all poses are known, so are unit and axes: then only
+/// points and clocks are found.
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
-    let (who, sights, pairing): (Vec<Who>, Vec<CameraView>, Pairing) = match options.walking {
+    let (who, sights, pairing): (Vec<CameraFrame>, Vec<CameraView>, Pairing) = match options.walking {
         None => {
             let sights = pictures::fixed(pictures, &options.look, progress)?;
             ((0..sights.len()).map(|c| (c, None)).collect(), sights, Pairing::All)
@@ -128,13 +128,13 @@ pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress
     solve_sights(&who, &sights, pairing, options, progress)
 }
 
-/// So many frames are all compared with each other.
+/// This many frames are all compared with each other.
 const ALL_UP_TO: usize = 50;
 /// Of more, neighbours and loops.
 const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
 
 fn solve_sights(
-    who: &[Who],
+    who: &[CameraFrame],
     sights: &[CameraView],
     pairing: Pairing,
     options: &Options,
@@ -161,7 +161,7 @@ fn solve_sights(
 }
 
 /// The solution whose unit is the median distance of cameras from what they see.
-fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize) -> Solution {
+fn in_units(who: &[CameraFrame], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize) -> Solution {
     let mut distances = vec![Vec::new(); sights.len()];
     for p in &mapped.points {
         for &s in &p.seen {
@@ -174,9 +174,9 @@ fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: u
     solution(who, sights, mapped, pairs, scale)
 }
 
-/// The solution in a unit of so many of the map's.
-fn solution(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
-    let placed = |(camera, sight): (&Result<mapper::Stand, String>, &CameraView)| {
+/// The solution in a unit of this many of the map's.
+fn solution(who: &[CameraFrame], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
+    let placed = |(camera, sight): (&Result<mapper::PlacedCamera, String>, &CameraView)| {
         camera.as_ref().map_err(Clone::clone).map(|c| Placed {
             pose: Se3 { rotation: c.pose.rotation, translation: c.pose.translation.map(|t| t * scale) },
             lens: c.lens.scaled(sight.factor),

@@ -1,11 +1,10 @@
 //! Places of features made exact: the windows about one point in all its images are laid over each other.
 //!
-//! A detector finds the middle of a blob, which is another place of the thing from every side, some tenths of a pixel off. What
-//! counts for poses is that all images mean the same place: the window of one image, warped as a small plane at the
-//! point
+//! A detector finds the middle of a blob, which is another point of the object from every side, some tenths of a pixel
+//! off. For poses, all images must locate the same point: the window of one image, warped as a small plane at the point
 //! would be seen from the other camera, is moved over the other image until they agree best (Lucas and Kanade 1981,
-//! with an
-//! affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by Lindenberger et al. 2021).
+//! with an affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by
+//! Lindenberger et al. 2021).
 
 use super::lens::Lens;
 use splat4d::math::Se3;
@@ -62,8 +61,8 @@ impl Shown {
     }
 }
 
-/// Weights of four neighbours at a place between the middle two (Catmull and Rom 1974): linear ones blur, by how much depends on
-/// the place, and draw places to pixels' middles.
+/// Weights of four neighbours at a position between the middle two (Catmull and Rom 1974): linear ones blur, by how
+/// much depends on the position, and bias positions to pixel centres.
 fn cubic(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t + 2.0 * t2 - t3), 0.5 * (2.0 - 5.0 * t2 + 3.0 * t3), 0.5 * (t + 4.0 * t2 - 3.0 * t3), 0.5 * (t3 - t2)]
@@ -108,7 +107,7 @@ impl Eye<'_> {
         )
     }
 
-    /// Where a point that moves is seen, and how fast.
+    /// Image position and velocity of a moving point.
     pub(super) fn moving(&self, x: [f64; 3], speed: [f64; 3]) -> Option<([f64; 2], [f64; 2])> {
         Some((self.pixel(x)?, self.slopes(x)?.map(|row| dot(row, speed))))
     }
@@ -119,7 +118,7 @@ impl Eye<'_> {
 pub(super) struct ImagePoint<'a> {
     /// The image.
     pub shown: Option<&'a Shown>,
-    /// Where in it.
+    /// Position in it.
     pub place: [f64; 2],
     /// From where.
     pub eye: Eye<'a>,
@@ -146,21 +145,21 @@ pub(super) fn speed(x: [f64; 3], seen: &[ImagePoint<'_>], velocities: &[[f64; 2]
 const REACH: isize = 7;
 const SPREAD: f64 = 4.0;
 const SIDE: usize = 2 * REACH as usize + 1;
-/// Steps at most; it rests at steps shorter than so many pixels.
+/// Steps at most; it rests at steps shorter than this many pixels.
 const STEPS: usize = 20;
 const STILL: f64 = 0.003;
-/// Farthest that a place may move, pixels.
+/// Farthest that a position may move, pixels.
 const FARTHEST: f64 = 1.5;
-/// Windows whose correlation is less do not show one thing from both sides.
+/// Windows whose correlation is less do not show one object from both sides.
 const ALIKE: f64 = 0.9;
 /// Standard deviation of grey values in a window, of 255: less has nothing to lay over.
 const FLAT: f64 = 4.0;
 /// How far the warp may differ from a plane's that faces the cameras: slanted planes are up to twice as narrow.
 const SLANT: f64 = 1.0;
 
-/// The place of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that do not agree
-/// have none. The most central one itself stays. All `None`: nothing can be said. Then the same of `more` cameras, whose places
-/// are guesses.
+/// The position of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that
+/// do not agree have none. The most central one itself stays. All `None`: nothing can be determined. Then the same of
+/// `more` cameras, whose places are guesses.
 pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'_>]) -> Vec<Option<[f64; 2]>> {
     let toward: Vec<[f64; 3]> = seen.iter().map(|s| normalize(sub(s.eye.center(), x))).collect();
     let central = |k: usize| toward.iter().map(|t| dot(*t, toward[k])).sum::<f64>();
@@ -176,7 +175,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'
     out
 }
 
-/// How pixels about a point in one image are in another one, if it stands on a plane with this normal.
+/// How pixels about a point in one image are in another one, if it is on a plane with this normal.
 fn warp(x: [f64; 3], normal: [f64; 3], from: &ImagePoint<'_>, to: &ImagePoint<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;
@@ -217,7 +216,7 @@ impl Template {
         (variance.sqrt() > FLAT).then_some(Self { values })
     }
 
-    /// How far the place of another sighting is from where its window agrees with this one.
+    /// How far the position of another sighting is from where its window agrees with this one.
     fn over(&self, other: &ImagePoint<'_>, start: [[f64; 2]; 2]) -> Option<[f64; 2]> {
         /// Shift, warp, gain, offset.
         const N: usize = 8;
@@ -281,7 +280,7 @@ mod tests {
     use splat4d::math::Rng;
     use splat4d_train::vision::raster::{blurred, sample};
 
-    /// What a camera sees of a textured wall z = 0, brightened.
+    /// A camera's image of a textured wall z = 0, brightened.
     fn wall(eye: Eye<'_>, texture: &Planes<f32>, gain: f32) -> Shown {
         let (width, height) = (160, 120);
         let mut grey = Planes::<f32>::new(1, height, width);
@@ -306,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn places_of_one_point_agree_to_hundredths_of_a_pixel_and_other_things_are_left_out() {
+    fn patches_of_one_point_align_to_hundredths_of_a_pixel_and_others_are_left_out() {
         let lens = Lens { k1: -0.01, ..Lens::plain(150.0, 160, 120) };
         let eyes = [[-0.9, -0.2, -2.0], [0.0, 0.1, -2.2], [0.8, 0.3, -1.9], [0.3, -0.5, -2.1]];
         let poses = eyes.map(|e| Se3::look_at(e, [0.0; 3], [0.0, -1.0, 0.0]));

@@ -1,4 +1,4 @@
-//! What cameras see, as features: of the static background on the median image, of what moves at times that all share.
+//! Features of cameras: of the static background on the median image, of what moves at times that all share.
 
 use super::lens::Known;
 use super::overlay::Shown;
@@ -20,7 +20,7 @@ pub trait Pictures: Sync {
     fn name(&self, camera: usize) -> String;
     /// How many frames a camera has.
     fn frames(&self, camera: usize) -> usize;
-    /// When a frame was taken, seconds on the clock that all share as far as it is known; ascending.
+    /// When a frame was taken, seconds on the common clock as far as known; ascending.
     fn time(&self, camera: usize, frame: usize) -> f64;
     /// A frame's image: 3 channels in [0, 1]. All frames of a camera are of one size.
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>>;
@@ -32,17 +32,17 @@ pub trait Pictures: Sync {
     fn lens(&self, camera: usize) -> usize {
         camera
     }
-    /// Its lens, or lens and place, where they are known exactly.
+    /// Its lens, or lens and position, where they are known exactly.
     fn known(&self, _camera: usize) -> Option<Known> {
         None
     }
-    /// What of a camera's frame counts: one channel, above one half; all of it where there is none.
+    /// Mask of a camera's frame: one channel, above one half; all of it where there is none.
     fn mask(&self, _camera: usize, _frame: usize) -> Result<Option<Planes<f32>>> {
         Ok(None)
     }
 }
 
-/// A place in an image that others may show too.
+/// A position in an image that others may show too.
 #[derive(Clone, Debug)]
 pub struct Feature {
     /// Pixels.
@@ -52,7 +52,7 @@ pub struct Feature {
     /// 0: it is static; otherwise which of the shared times it was seen at, from 1. Those of different times are
     /// never the same.
     pub moment: usize,
-    /// What it looks like.
+    /// Its descriptor.
     pub descriptor: [u8; NUMBERS],
     /// sRGB.
     pub color: [u8; 3],
@@ -69,23 +69,23 @@ pub struct CameraView {
     pub factor: f64,
     /// The focal length in pixels, where it is known roughly.
     pub focal: Option<f64>,
-    /// Whether the lens is known exactly: then features are where a pinhole camera of this focal length, its principal point in
-    /// the middle, sees them.
+    /// Whether the lens is known exactly: then features are where a pinhole camera of this focal length, its principal
+    /// point in the middle, sees them.
     pub exact: bool,
     /// Takes world points into the camera's axes, where that is known.
     pub pose: Option<Se3>,
-    /// Sights of one number share a lens.
+    /// Sights with the same number share a lens.
     pub lens: usize,
     /// How long a frame lasts, seconds.
     pub frame: f64,
     /// In the order of times.
     pub features: Vec<Feature>,
-    /// What each time's features are from, by the time's number; none of a lens that is known, whose features were
+    /// Source of each time's features, by the time's number; none of a lens that is known, whose features were
     /// straightened.
     pub shown: Vec<Option<Shown>>,
 }
 
-/// What features are taken from.
+/// Source of features.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FeatureOptions {
     /// Times at which features are taken from dynamic regions.
@@ -102,20 +102,20 @@ pub struct FeatureOptions {
 
 impl Default for FeatureOptions {
     fn default() -> Self {
-        // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three layers) and ten
-        // times map it. Poses of the bundled capture are 1.3 times as exact with 25 times as with ten.
+        // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three
+        // layers) and ten times map it. Poses of the bundled capture are 1.3 times as exact with 25 times as with ten.
         Self { moments: 16, contrast: 0.003, still: 4000, moving: 800, pixels: 1_200_000 }
     }
 }
 
 /// Frames whose median is the static background.
 const MEDIAN_OF: usize = 15;
-/// From so many frames on a median knows the static background.
+/// From this many frames on a median gives the static background.
 const MEDIAN_FROM: usize = 3;
 /// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
 /// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
-/// Differences are blurred by so many pixels: single ones are noise.
+/// Differences are blurred by this many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 /// A frame farther from a time than this many frames does not show it.
 const TOO_FAR: f64 = 1.0;
@@ -147,7 +147,7 @@ fn bytes(picture: &Planes<f32>) -> Vec<u8> {
     picture.data.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect()
 }
 
-/// What of an image counts.
+/// Mask of an image.
 struct Mask {
     mask: Planes<f32>,
     size: [usize; 2],
@@ -241,8 +241,8 @@ pub(crate) fn fixed(
     let clock = (0..count).find(|&c| !still(c)).filter(|_| first < last);
     let moments: Vec<f64> = if let Some(clock) = clock {
         let step = (last - first) / look.moments as f64;
-        // Each at a frame of one camera: where clocks agree no feature is brought to another time by its own velocity, whose noise
-        // it would take along.
+        // Each at a frame of one camera: where clocks agree no feature is brought to another time by its own velocity,
+        // whose noise it would take along.
         let frames: Vec<f64> = (0..pictures.frames(clock)).map(|k| pictures.time(clock, k)).collect();
         let near = |t: f64| frames.iter().copied().min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs()));
         let mut all: Vec<f64> = (0..look.moments).filter_map(|k| near(first + (k as f64 + 0.5) * step)).collect();
@@ -312,7 +312,7 @@ impl CameraView {
         let Some(known) = pictures.known(camera) else { return self };
         let straight = known.straight(self.size, self.factor);
         self.features.retain_mut(|f| straight.feature(f));
-        // Images are as the lens bent them: places of straightened features are not theirs.
+        // Images are as the lens bent them: positions of straightened features are not theirs.
         Self { focal: Some(straight.focal()), exact: true, pose: known.pose, shown: Vec::new(), ..self }
     }
 }
@@ -326,7 +326,7 @@ struct Window {
 }
 
 impl Window {
-    /// What holds all wanted pixels and enough about them for features and velocities; `None`: there are none.
+    /// Box around all requested pixels, with a margin for features and velocities; `None`: there are none.
     fn around(width: usize, height: usize, wanted: &dyn Fn(usize, usize) -> bool) -> Option<Self> {
         /// Descriptors of ordinary features and motion of a frame reach no farther, pixels.
         const MARGIN: usize = 48;
@@ -353,9 +353,8 @@ impl Window {
     }
 }
 
-/// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next
-/// to the
-/// frame's. And what they are from.
+/// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next to the
+/// frame's. And their sources.
 fn moving(
     pictures: &dyn Pictures,
     camera: usize,
@@ -449,7 +448,7 @@ pub(crate) fn walking(
                     ..empty(pictures, camera, [picture.width, picture.height], factor)
                 };
                 let sight = sight.straightened(pictures, camera);
-                // One frame's place is not the camera's.
+                // One frame's position is not the camera's.
                 Ok(CameraView { pose: None, ..sight })
             })
             .collect();

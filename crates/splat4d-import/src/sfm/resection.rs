@@ -1,4 +1,4 @@
-//! Where a camera stands that sees known points, and with which focal length.
+//! Pose and focal length of a camera that sees known points.
 
 use super::algebra::{orthonormal, roots, rotation};
 use super::lens::{Lens, off};
@@ -7,8 +7,8 @@ use splat4d::math::cholesky::Cholesky;
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub, transpose};
 use splat4d::math::{Rng, Se3, mat3};
 
-/// The poses (at most four) from which three points are seen along three rays: Grunert's solution (1841) as in Haralick et al.
-/// 1994, "Review and analysis of solutions of the three point perspective pose estimation problem".
+/// The poses (at most four) from which three points are seen along three rays: Grunert's solution (1841) as in Haralick
+/// et al. 1994, "Review and analysis of solutions of the three point perspective pose estimation problem".
 ///
 /// `points` in the world, `rays` in the camera's axes, of any length.
 pub(crate) fn three(points: &[[f64; 3]; 3], rays: &[[f64; 3]; 3]) -> Vec<Se3> {
@@ -118,8 +118,8 @@ impl Data for Resection<'_> {
     }
 }
 
-/// Least squares of the distances from where known points are seen, by Gauss-Newton steps that are damped (Levenberg-Marquardt);
-/// Cauchy's loss of this `scale` in pixels, ∞: plain squares.
+/// Least squares of the distances from where known points are seen, by Gauss-Newton steps that are damped
+/// (Levenberg-Marquardt); Cauchy's loss of this `scale` in pixels, ∞: plain squares.
 pub(crate) fn polish(start: &Placed, known: &[Known], focal: bool, scale: f64) -> Placed {
     const STEPS: usize = 12;
     const N: usize = 7;
@@ -186,10 +186,10 @@ const MOST: usize = 2000;
 /// Chance of leaving too early.
 const MISSED: f64 = 1e-3;
 
-/// Where so large a share of the points agrees with a lens whose focal length adapts, others need not be tried.
+/// If such a share of the points agrees with a lens whose focal length adapts, others need not be tried.
 const ENOUGH: f64 = 0.6;
 
-/// The camera that sees most of the known points where it does, with one of these lenses or, where `free`, one of a focal length
+/// The camera that explains most of the known points, with one of these lenses or, where `free`, one of a focal length
 /// near theirs. `tolerance` in pixels.
 pub(crate) fn place(
     known: &[Known],

@@ -1,11 +1,11 @@
-//! Models that most of the data agree on: locally optimised sample consensus (Chum, Matas and Kittler 2003) with the score
-//! of MSAC (Torr and Zisserman 2000).
+//! Models that most of the data agree on: locally optimised sample consensus (Chum, Matas and Kittler 2003) with the
+//! score of MSAC (Torr and Zisserman 2000).
 
 use splat4d::math::Rng;
 
-/// What a model is searched for in.
+/// Data of the search for a model.
 pub(crate) trait Data {
-    /// What is searched for.
+    /// The model.
     type Model: Clone;
     /// Data that a model is made of.
     const SAMPLE: usize;
@@ -19,7 +19,7 @@ pub(crate) trait Data {
     fn polish(&self, model: &Self::Model, inliers: &[usize]) -> Option<Self::Model>;
 }
 
-/// How long is looked, and what agrees.
+/// Number of trials, and the inlier threshold.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Search {
     /// Data nearer than this to a model agree with it, pixels.

@@ -21,8 +21,8 @@ struct Rig {
     sights: Vec<CameraView>,
 }
 
-/// Cameras on an arc around points, seven tenths of which move; every feature off by `noise` pixels, and `wrong` of them look like
-/// another one. Focal lengths differ by `spread`.
+/// Cameras on an arc around points, seven tenths of which move; every feature off by `noise` pixels, and `wrong` of
+/// them look like another one. Focal lengths differ by `spread`.
 fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Rig {
     let rng = Rng::new(21, "rig", 0);
     let look = |p: usize, c: usize| {
@@ -180,7 +180,7 @@ fn equal_lenses_share_parameters_and_others_do_not() {
         let zooms: Vec<f64> = (found.taken.iter().zip(&rig.lenses))
             .map(|(t, lens)| (t.placed.as_ref().unwrap().lens.focal / lens.focal).ln())
             .collect();
-        // What all have in common is determined by the scene's depth alone.
+        // The common part is determined by the scene's depth alone.
         let mean = zooms.iter().sum::<f64>() / zooms.len() as f64;
         assert!(zooms.iter().all(|z| (z - mean).abs() < within), "differing by {spread}: {zooms:?}");
     }
@@ -287,7 +287,7 @@ fn walk(cameras: usize) -> Walk {
 }
 
 #[test]
-fn what_moves_is_seen_at_times_with_its_velocity() {
+fn moving_features_have_times_and_velocities() {
     let mut silent = |_: &_| {};
     let look = FeatureOptions { moments: 3, ..FeatureOptions::default() };
     let sights = fixed(&walk(1), &look, &mut Progress(&mut silent)).unwrap();

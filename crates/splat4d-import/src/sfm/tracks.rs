@@ -1,4 +1,4 @@
-//! Features of many images that show one place: matched without any pose, verified two images at a time, joined.
+//! Features of many images that show one point: matched without any pose, verified two images at a time, joined.
 
 use super::pictures::{CameraView, Feature};
 use super::two_view::{Pair, fundamental, unlike_focal};
@@ -13,9 +13,9 @@ use splat4d_train::vision::triangulate::Transfer;
 
 /// The second best match must be this many times farther away (Lowe 2004; measured on the hall of `Look`).
 const RATIO: f32 = 0.8;
-/// Features nearer than this to each other show one place: no rivals, pixels.
+/// Features nearer than this to each other show one point: no rivals, pixels.
 const SAME: f64 = 1.5;
-/// Pairs of images with fewer verified matches say nothing: seven always agree.
+/// Pairs of images with fewer verified matches carry no information: seven always agree.
 const LEAST: usize = 14;
 /// Of the matches the least share that is verified: by chance more agree only among few.
 const LEAST_SHARE: f64 = 0.15;
@@ -31,14 +31,14 @@ pub struct Link {
     pub matches: Vec<([usize; 2], f32)>,
     /// From pixels (about the middle of the first image) to lines of the second; zero where poses led to the matches.
     pub fundamental: [[f64; 3]; 3],
-    /// All that look alike, whether they agree with one motion or not; empty where poses led to the matches.
+    /// All matches, whether they agree with one motion or not; empty if the matches were guided by poses.
     pub alike: Vec<[usize; 2]>,
 }
 
-/// A place that several sights see.
+/// A point that several sights see.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Track {
-    /// Numbers of the sights, ascending and none twice, and of their features.
+    /// Numbers of the sights, ascending without duplicates, and of their features.
     pub seen: Vec<(usize, usize)>,
 }
 
@@ -47,11 +47,11 @@ pub struct Track {
 pub(crate) enum Pairing {
     /// All with all.
     All,
-    /// Frames of a walk: with so many that follow, and every one of these many with all others of them.
+    /// Frames of a walk: with this many that follow, and every one of these many with all others of them.
     Sequence {
         /// How many that follow.
         near: usize,
-        /// Every so many-th is compared with all others of that kind: loops.
+        /// Every n-th is compared with all others of that kind: loops.
         every: usize,
     },
 }
@@ -78,7 +78,7 @@ struct Rows {
 
 fn rows(features: &[Feature]) -> Vec<Rows> {
     let last = features.iter().map(|f| f.moment).max().unwrap_or(0);
-    assert!(features.is_sorted_by_key(|f| f.moment), "features come in the order of moments");
+    assert!(features.is_sorted_by_key(|f| f.moment), "features are ordered by time");
     let of = |m: usize| {
         let from = features.partition_point(|f| f.moment < m);
         let to = features.partition_point(|f| f.moment <= m);
@@ -141,7 +141,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
     let places = |k: usize| from[a.features.start + k].pixel;
     let mut out = Vec::new();
     for (i, (j, ratio)) in forth.into_iter().enumerate() {
-        // Another feature of the same place may be the best one back.
+        // Another feature of the same point may be the best one back.
         let (p, q) = (places(back[j].1), places(i));
         let agree = back[j].1 == i || (p[0] - q[0]).abs().max((p[1] - q[1]).abs()) < SAME;
         if ratio < RATIO && agree {
@@ -172,7 +172,7 @@ pub(crate) fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress
     out
 }
 
-/// What is known of a placed sight: where its features would be without distortion, by the clock that all share.
+/// Data of a placed sight: its undistorted features, at the common time.
 pub(crate) struct Known {
     /// Without distortion.
     pub camera: Camera,
@@ -182,11 +182,10 @@ pub(crate) struct Known {
 
 /// Second-best matches are searched for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
-/// What is alone on its line must be as good as if something quite unlike stood next to it: squared distance of
-/// descriptors, an
-/// eighth of the largest there is.
+/// A match without a competitor on its line must beat an unlike one: squared distance of descriptors, an eighth of the
+/// largest there is.
 const FAR: f32 = 65_536.0;
-/// Cameras whose axes are farther apart see other sides of things, degrees.
+/// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 80.0;
 
 /// Compares placed images along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
@@ -309,10 +308,10 @@ fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2],
     })
 }
 
-/// Joins the matches of all links, surest first, so that no track has two places of one sight. Tracks ascend by their first
-/// features.
+/// Joins the matches of all links, surest first, so that no track has two features of one sight. Tracks ascend by their
+/// first features.
 pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
-    // Features of exactly one place are one.
+    // Features of exactly one position are one.
     let mut starts = vec![0];
     let mut place_of: Vec<Vec<usize>> = Vec::with_capacity(sights.len());
     let mut first_of: Vec<usize> = Vec::new();
@@ -360,7 +359,7 @@ pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
 /// link votes for
 /// those with which its fundamental matrix is an essential one.
 pub(crate) fn focal_votes(sights: &[CameraView], links: &[Link], candidates: &[f64]) -> Vec<f64> {
-    /// What a matrix of noisy matches misses, at the right focal length: the vote falls to 1/e.
+    /// Residual of a matrix of noisy matches at the right focal length: the vote falls to 1/e.
     const OFF: f64 = 0.05;
     let vote = |focal: f64| -> f64 {
         let of = |l: &Link| {

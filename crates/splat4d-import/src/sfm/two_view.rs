@@ -1,5 +1,4 @@
-//! What two images of one scene say about each other: fundamental and essential matrices, and the motion between their
-//! cameras.
+//! Two-view geometry: fundamental and essential matrices, and the motion between their cameras.
 
 use super::algebra::{
     Mat3, add, eliminate, least_vector, multiply, null_space, orthonormal, roots, rotation, skew, svd, value,
@@ -9,11 +8,11 @@ use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, transpos
 use splat4d::math::{Rng, Se3};
 use std::sync::LazyLock;
 
-/// A place as the first and the second image show it.
+/// A position as the first and the second image show it.
 pub type Pair = [[f64; 2]; 2];
 
-/// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of them
-/// with any chance.
+/// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of
+/// them with any chance.
 const MOST: usize = 3000;
 /// Chance of leaving too early.
 const MISSED: f64 = 1e-3;
@@ -61,8 +60,8 @@ fn seven(sample: &[Pair]) -> Vec<Mat3> {
         .collect()
 }
 
-/// Pairs in which a fundamental matrix is searched for, about the images' middles and in units of their size, so that the
-/// system is well conditioned (Hartley 1997).
+/// Pairs in which a fundamental matrix is searched for, about the images' middles and in units of their size, so that
+/// the system is well conditioned (Hartley 1997).
 struct Uncalibrated<'a> {
     pairs: &'a [Pair],
     unit: f64,
@@ -119,8 +118,8 @@ pub(crate) fn fundamental(pairs: &[Pair], size: f64, tolerance: f64, rng: Rng) -
     Some(found)
 }
 
-/// How far a fundamental matrix is from one of two cameras of this focal length: 1 − σ₂/σ₁ of the essential matrix, whose
-/// first two singular values are equal. 0 is perfect.
+/// How far a fundamental matrix is from one of two cameras of this focal length: 1 − σ₂/σ₁ of the essential matrix,
+/// whose first two singular values are equal. 0 is perfect.
 pub(crate) fn unlike_focal(f: &Mat3, focal: f64) -> f64 {
     let k = [focal, focal, 1.0];
     let e: Mat3 = std::array::from_fn(|i| std::array::from_fn(|j| f[i][j] * k[i] * k[j]));
@@ -128,8 +127,8 @@ pub(crate) fn unlike_focal(f: &Mat3, focal: f64) -> f64 {
     if s[0] > 0.0 { 1.0 - s[1] / s[0] } else { 1.0 }
 }
 
-/// Exponents of x, y and z of the monomials of degree three and less, in the order of Nistér 2004, so that ten of them can be
-/// eliminated and what is left are polynomials in z times x, y and 1.
+/// Exponents of x, y and z of the monomials of degree three and less, in the order of Nistér 2004, so that ten of them
+/// can be eliminated and the remaining equations are polynomials in z times x, y and 1.
 const MONOMIALS: [[usize; 3]; 20] = [
     [3, 0, 0],
     [0, 3, 0],
@@ -156,7 +155,7 @@ const MONOMIALS: [[usize; 3]; 20] = [
 /// A polynomial in x, y and z: a coefficient for each of [`MONOMIALS`].
 type Cubic = [f64; 20];
 
-/// The place of every product of two monomials in [`MONOMIALS`]; 20: of degree above three.
+/// The position of every product of two monomials in [`MONOMIALS`]; 20: of degree above three.
 static PRODUCTS: LazyLock<[[usize; 20]; 20]> = LazyLock::new(|| {
     let place = |a: [usize; 3], b: [usize; 3]| {
         let sum: [usize; 3] = std::array::from_fn(|k| a[k] + b[k]);
@@ -165,8 +164,8 @@ static PRODUCTS: LazyLock<[[usize; 20]; 20]> = LazyLock::new(|| {
     std::array::from_fn(|i| std::array::from_fn(|k| place(MONOMIALS[i], MONOMIALS[k])))
 });
 
-/// The essential matrices of five pairs of rays (depth 1): b·E·a = 0, det E = 0 and 2 E Eᵀ E = tr(E Eᵀ) E (Nistér 2004, "An
-/// efficient solution to the five-point relative pose problem").
+/// The essential matrices of five pairs of rays (depth 1): b·E·a = 0, det E = 0 and 2 E Eᵀ E = tr(E Eᵀ) E (Nistér 2004,
+/// "An efficient solution to the five-point relative pose problem").
 pub fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
     let rows: Vec<[f64; 9]> = sample.iter().map(row).collect();
     let null = null_space(&rows);
@@ -257,7 +256,7 @@ pub(crate) fn motions(e: &Mat3) -> [Se3; 4] {
     [(1.0, t), (1.0, back), (-1.0, t), (-1.0, back)].map(|(s, t)| Se3 { rotation: turn(s), translation: t })
 }
 
-/// Depths along the two rays of a pair at which they come nearest to each other.
+/// Depths along the two rays of a pair at which they are nearest to each other.
 pub(crate) fn depths(motion: &Se3, &[a, b]: &Pair) -> [f64; 2] {
     let a = mat_vec(&motion.rotation, long(a));
     let b = long(b);
@@ -302,8 +301,8 @@ impl Data for Calibrated<'_> {
     }
 }
 
-/// The motion of least squares of the first-order distances of pairs of rays, near a given one: Gauss-Newton on the rotation
-/// and on the direction of the translation.
+/// The motion of least squares of the first-order distances of pairs of rays, near a given one: Gauss-Newton on the
+/// rotation and on the direction of the translation.
 pub(crate) fn polish_motion(start: &Se3, rays: &[Pair]) -> Se3 {
     /// From a good start the steps shrink as fast as rounding allows.
     const STEPS: usize = 10;

@@ -110,7 +110,7 @@ impl Rig {
         out
     }
 
-    /// Perfect tracks of the lights with noise of so many pixels.
+    /// Perfect tracks of the lights with noise of this many pixels.
     pub(super) fn tracks(&self, camera: usize, frames: usize, noise: f64) -> Vec<Track> {
         let track = |k: usize| {
             let rng = Rng::new(9, "noise of drawn tracks", (camera * 1000 + k) as u64);

@@ -1,5 +1,5 @@
-//! Lags by geometry: what moves is on the epipolar line of where the other camera saw it at the same time, and leaves the
-//! line at any other.
+//! Lags by geometry: a moving point is on the epipolar line of its sighting in the other camera at the same time, and
+//! leaves the line at any other.
 
 use super::tracks::Track;
 use super::{NORMAL_MAD, Refusal, median};
@@ -7,24 +7,26 @@ use rayon::prelude::*;
 use splat4d::math::se3::{mat_mul, mat_vec, norm, sub, transpose};
 use splat4d::scene::Camera;
 
-/// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact to.
+/// Pixels off the epipolar line from which on a match at some lag is rejected: a few times what corners and poses are
+/// exact to.
 const TOLERANCE: f64 = 3.0;
 /// Pixels that corners and poses are usually off, together, in the search.
 const USUAL: f64 = 1.0;
-/// So many times of a track count as independent of each other: what is wrong with a corner is wrong for some frames.
+/// This many times of a track count as independent of each other: what is wrong with a corner is wrong for some frames.
 const INDEPENDENT: f64 = 5.0;
 /// Likelihood that a track has no match, of that of a perfect one.
 const NO_MATCH: f64 = 0.05;
 /// Steps of the search in median intervals between frames.
 const GRID: f64 = 0.5;
-/// Pixels that a track must move to say anything.
+/// Pixels that a track must move to be informative.
 const MOVES: f64 = 2.0;
 /// Matches that a lag needs.
 const MATCHES: usize = 8;
 /// Times that a match must have in common.
 const COMMON: usize = 3;
-/// By how much the best lag's log-likelihood must exceed the median over lags, in median absolute deviations of lags. All of
-/// 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common the other bound decides.
+/// By how much the best lag's log-likelihood must exceed the median over lags, in median absolute deviations of lags.
+/// All of 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common the other bound
+/// decides.
 const STANDS_OUT: f64 = 2.5;
 /// And by how much for every track: tracks without anything in common reach 0.02 by chance, pairs of the hall
 /// 0.23 to 1.05.
@@ -35,7 +37,7 @@ const AS_GOOD: f64 = 0.75;
 const LOBE: f64 = 1.5;
 /// The largest uncertainty that is a lag, in intervals.
 const VAGUE: f64 = 0.35;
-/// How often matches are chosen and the lag is refined in turn.
+/// Rounds of matching and refining the lag.
 const ROUNDS: usize = 3;
 /// The least that a corner is off, pixels: uncertainties must not vanish with noise-free data.
 const EXACT: f64 = 0.02;
@@ -55,18 +57,18 @@ pub(crate) struct EpipolarLag {
     pub error: f64,
 }
 
-/// Where to look.
+/// Range of the search.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
     /// The middle, seconds.
     pub around: f64,
-    /// So many seconds to either side.
+    /// This many seconds to either side.
     pub within: f64,
 }
 
 /// How much later camera b notes what camera a notes, by tracks in undistorted pixels and the fundamental matrix
-/// (`x_bᵀ F x_a = 0`). `matches` are pairs of tracks that may show the same point, some of them wrongly; without them all
-/// pairs are tried.
+/// (`x_bᵀ F x_a = 0`). `matches` are pairs of tracks that may show the same point, some of them wrongly; without them
+/// all pairs are tried.
 pub(crate) fn lag(
     f: &[[f64; 3]; 3],
     [a, b]: [&[Track]; 2],
@@ -94,7 +96,7 @@ pub(crate) fn lag(
     if costs.len() < MATCHES {
         return Err(Refusal::Unrelated);
     }
-    let best = stands_out(&grid, &likelihoods(&costs, a.len(), grid.len()), costs.len().min(a.len()), interval)?;
+    let best = is_prominent(&grid, &likelihoods(&costs, a.len(), grid.len()), costs.len().min(a.len()), interval)?;
     let mut lag = grid[best];
     let mut matched = Vec::new();
     for _ in 0..ROUNDS {
@@ -131,7 +133,7 @@ pub(crate) fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
     mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
 }
 
-/// Pairs of cameras, each with so many that stand nearest to it, in order; None: a camera that takes no part.
+/// Pairs of cameras, each with this many that are nearest to it, in order; None: a camera that takes no part.
 pub fn neighbours(centers: &[Option<[f64; 3]>], count: usize) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     for (a, own) in centers.iter().enumerate() {
@@ -152,7 +154,7 @@ fn interval(tracks: &[Track]) -> f64 {
     median(&mut steps.collect::<Vec<_>>())
 }
 
-/// Where a track was, and the squared slope of the line there; None: it was not.
+/// Position of a track and the squared slope of the line there; none: outside the track.
 type TrackPoint = Option<([f64; 2], f64)>;
 
 /// A pair of tracks and its mean squared distance at every lag.
@@ -170,8 +172,8 @@ fn likelihoods(costs: &[Costs], tracks: usize, lags: usize) -> Vec<f64> {
     (0..lags).map(|k| known.iter().map(|s| (NO_MATCH + s[k]).ln()).sum()).collect()
 }
 
-/// The place of the highest likelihood, if it is much higher than elsewhere.
-fn stands_out(grid: &[f64], heights: &[f64], tracks: usize, interval: f64) -> Result<usize, Refusal> {
+/// The position of the highest likelihood, if it is much higher than elsewhere.
+fn is_prominent(grid: &[f64], heights: &[f64], tracks: usize, interval: f64) -> Result<usize, Refusal> {
     let highest = |of: &mut dyn Iterator<Item = usize>| of.max_by(|&i, &j| heights[i].total_cmp(&heights[j]));
     let best = highest(&mut (0..grid.len())).expect("the grid is not empty");
     let usual = median(&mut heights.to_vec());
@@ -223,8 +225,8 @@ impl Problem<'_> {
 
     /// Mean squared distances of pairs at every lag, none more than the tolerance's; only pairs that fit somewhere.
     fn costs(&self, pairs: &[[usize; 2]], grid: &[f64]) -> Vec<Costs> {
-        // Everything that does not depend on the pair comes first: lines of the one's places, places of the other and their
-        // lines, by time.
+        // Everything that does not depend on the pair comes first: lines of the one's positions, positions of the other
+        // and their lines, by time.
         let mut times: Vec<f64> = self.a.iter().flat_map(|t| t.samples.iter().map(|s| s.0)).collect();
         times.sort_by(f64::total_cmp);
         times.dedup();
@@ -257,7 +259,8 @@ impl Problem<'_> {
         out
     }
 
-    /// The mean of the squared distances, none more than the tolerance's; that of the tolerance where there are too few.
+    /// The mean of the squared distances, none more than the tolerance's; that of the tolerance where there are too
+    /// few.
     fn cost(&self, pair: [usize; 2], lag: f64) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for d in self.distances(pair, lag) {
@@ -286,7 +289,7 @@ impl Problem<'_> {
         fits.into_iter().filter(best).map(|f| f.0).collect()
     }
 
-    /// Where the first camera saw the pairs when the second did at all lags between two.
+    /// Positions of the pairs in the first camera at the second one's times, at all lags between two.
     fn sightings(&self, pairs: &[[usize; 2]], ends: [f64; 2]) -> Vec<Sightings> {
         let of = |&pair: &[usize; 2]| {
             let other = &self.b[pair[1]];
@@ -315,9 +318,9 @@ impl Problem<'_> {
         matched.iter().map(of).sum::<f64>() / matched.len() as f64
     }
 
-    /// How much a match pulls at the lag (px²/s), and its information on it (px²/s²): the mean square of how fast it leaves the
-    /// line. Its times count as one, for what is wrong with a track is wrong at all of them. The variance of the lag is the sum
-    /// of the squared pulls over the squared sum of the information (White 1980).
+    /// How much a match pulls at the lag (px²/s), and its information on it (px²/s²): the mean square of how fast it
+    /// leaves the line. Its times count as one, for what is wrong with a track is wrong at all of them. The variance of
+    /// the lag is the sum of the squared pulls over the squared sum of the information (White 1980).
     fn information(&self, m: &Sightings, lag: f64, step: f64, scale: f64) -> (f64, f64) {
         let (mut pull, mut sum, mut count) = (0.0, 0.0, 0.0f64);
         for &(t, x) in &m.places {
@@ -353,7 +356,7 @@ pub(crate) fn sampson(f: &[[f64; 3]; 3], x: [f64; 2], y: [f64; 2]) -> f64 {
     if size > 0.0 { (y[0] * l[0] + y[1] * l[1] + l[2]) / size.sqrt() } else { 0.0 }
 }
 
-/// The least of a function with one minimum between two places (Kiefer 1953).
+/// The least of a function with one minimum between two positions (Kiefer 1953).
 fn golden(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64, resolution: f64) -> f64 {
     const PART: f64 = 0.618_033_988_749_894_8;
     let (mut x, mut y) = (high - PART * (high - low), low + PART * (high - low));

@@ -74,7 +74,7 @@ mod tests {
     use std::f64::consts::TAU;
 
     #[test]
-    fn a_transform_is_its_definition() {
+    fn a_transform_equals_its_definition() {
         for n in [1, 2, 8, 32] {
             let x: Vec<Complex> = (0..n).map(|i| [(i as f64 * 1.7).sin(), (i as f64 * 0.3).cos()]).collect();
             let mut fast = x.clone();
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_correlation_is_its_definition() {
+    fn a_correlation_equals_its_definition() {
         let a: Vec<f64> = (0..5).map(|i| (f64::from(i) * 2.3).sin()).collect();
         let b: Vec<f64> = (0..7).map(|i| (f64::from(i) * 1.1).cos()).collect();
         for (at, found) in correlate(&a, &b).into_iter().enumerate() {

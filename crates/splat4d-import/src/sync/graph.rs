@@ -1,5 +1,5 @@
-//! Offsets of all cameras from lags of pairs: robust least squares on the graph. What contradicts the rest is left out and
-//! named.
+//! Offsets of all cameras from lags of pairs: robust least squares on the graph. Lags that contradict the rest are left
+//! out and named.
 
 use serde::{Deserialize, Serialize};
 use splat4d::math::cholesky::Cholesky;
@@ -12,10 +12,10 @@ const LEAST_SIGMA: f64 = 1e-5;
 const NARROWER: f64 = 1.4;
 /// Steps at most.
 const STEPS: usize = 100;
-/// What keeps unconnected cameras from making the equations singular, relative to the least certain lag's weight.
+/// Ridge that keeps the equations regular for unconnected cameras, relative to the least certain lag's weight.
 const RIDGE: f64 = 1e-9;
 
-/// What a lag is from, the most trusted first.
+/// Source of a lag, the most trusted first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Kind {
     /// Given by the user.
@@ -51,11 +51,11 @@ pub struct Evidence {
     pub sigma: f64,
     /// Seconds by which it grows each second, where that is known.
     pub drift: Option<f64>,
-    /// What it is from.
+    /// Its source.
     pub kind: Kind,
 }
 
-/// What is added to a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
+/// Correction of a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Offset {
     /// Seconds.
@@ -91,12 +91,13 @@ pub(crate) struct Refused {
 pub(crate) struct Solution {
     /// Per camera; None: nothing connects it with camera 0 or one whose offset is given.
     pub offsets: Vec<Option<Offset>>,
-    /// What was left out.
+    /// Rejected lags.
     pub refused: Vec<Refused>,
 }
 
-/// Offsets of so many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is kept. Lags
-/// that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations contradict.
+/// Offsets of this many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is
+/// kept. Lags that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations
+/// contradict.
 pub(crate) fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], tolerance: f64) -> Solution {
     let mut known: Vec<Option<f64>> = (0..cameras).map(|c| given.get(c).copied().flatten()).collect();
     let told: Vec<bool> = known.iter().map(Option::is_some).collect();
@@ -194,14 +195,14 @@ impl Graph<'_> {
         values[a] - values[b] - self.evidence[k].lag
     }
 
-    /// The largest set of lags found that agree, in order: truncated least squares by graduated non-convexity, then what was
-    /// lost of the trusted ones is taken back where it leads to a camera that nothing else leads to.
+    /// The largest set of lags found that agree, in order: truncated least squares by graduated non-convexity, then
+    /// rejected trusted lags are restored if they alone connect a camera.
     fn agree(&self, edges: &[usize], known: &[Option<f64>]) -> Vec<usize> {
         if edges.is_empty() {
             return Vec::new();
         }
         let at = |k: usize| edges.iter().position(|&e| e == k).expect("it is one of the edges");
-        // Here all lags of a kind weigh alike: an echo is sure of itself, too.
+        // Here all lags of a kind weigh alike: an echo has a small sigma, too.
         let fit = |weights: &[f64]| {
             let weight = |k: usize| weights[at(k)] * self.trust(k) / self.allowed(k).powi(2);
             let terms: Vec<Term> =

@@ -79,7 +79,7 @@ pub struct Pyramid {
 impl Pyramid {
     /// At most `levels` sizes, none smaller than 16 pixels.
     pub(crate) fn new(picture: Grey, levels: usize) -> Self {
-        /// Shorter side of the smallest level: the window that is followed must have room.
+        /// Shorter side of the smallest level: the tracked window must fit.
         const SMALLEST: usize = 32;
         let mut all = vec![picture];
         while all.len() < levels {

@@ -30,9 +30,9 @@ pub(crate) enum Refusal {
     Unrelated,
     /// Several lags agree alike: what moves or sounds repeats itself. The two best, seconds.
     Repeating([f64; 2]),
-    /// What agrees leaves the lag open by so many seconds: motion along the epipolar lines.
+    /// Inliers leave the lag open by this many seconds: motion along the epipolar lines.
     Vague(f64),
-    /// The evidence grows or shrinks in time, by so many seconds a second: a wrong frame rate in a file.
+    /// The evidence grows or shrinks in time, by this many seconds a second: a wrong frame rate in a file.
     Drifting(f64),
 }
 
@@ -60,8 +60,7 @@ pub(crate) fn median(values: &mut [f64]) -> f64 {
 /// Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 pub(crate) const NORMAL_MAD: f64 = 1.4826;
 
-/// Where a parabola through three values, one step apart, has its extremum: −½ to ½ steps from the middle one, and the
-/// value there.
+/// Extremum of a parabola through three values, one step apart: −½ to ½ steps from the middle one, and the value there.
 fn parabola([left, middle, right]: [f64; 3]) -> (f64, f64) {
     let bend = left - 2.0 * middle + right;
     if bend.abs() < f64::MIN_POSITIVE {

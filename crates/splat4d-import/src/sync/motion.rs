@@ -1,5 +1,5 @@
-//! Lags by how much moves: a guess for other evidence to begin with. Two cameras see the same jump at the same time, but the
-//! same step of a runner again and again.
+//! Lags by how much moves: a guess for other evidence to begin with. Two cameras see the same jump at the same time,
+//! but the same step of a runner again and again.
 
 use super::grey::Grey;
 use super::{Refusal, fft::correlate, median, parabola};
@@ -11,9 +11,9 @@ const SIDE: usize = 160;
 const MOVES: f64 = 0.15 / 255.0;
 /// Cameras share at least this part of the shorter take.
 const MIN_OVERLAP: f64 = 0.4;
-/// And at least so many intervals.
+/// And at least this many intervals.
 const MIN_INTERVALS: usize = 12;
-/// The least correlation that is believed. Of one motion from different sides 0.4 to 0.9 was measured on drawn rigs.
+/// The least correlation that is believed. Of one motion from different sides 0.4 to 0.9 was measured on rendered rigs.
 const LEAST: f64 = 0.3;
 /// The least standard score: the correlation times the root of the number of intervals compared.
 const LEAST_SCORE: f64 = 4.5;

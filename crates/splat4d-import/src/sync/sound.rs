@@ -8,17 +8,18 @@ use crate::video::SOUND_RATE;
 const ENVELOPE_RATE: f64 = 200.0;
 /// Samples of a value of the envelope: 16 ms, of which neighbours share two thirds.
 const ENVELOPE_WINDOW: usize = 256;
-/// Borders of the envelope's bands, Hz: evenly spaced on the mel scale, from above rumble to where phones still hear well.
+/// Borders of the envelope's bands, Hz: evenly spaced on the mel scale, from above rumble to where phones still hear
+/// well.
 const BANDS: [f64; 5] = [150.0, 640.0, 1420.0, 2680.0, 4700.0];
-/// A band's silence, relative to its mean energy: what is below is no onset.
+/// A band's silence, relative to its mean energy: below it there are no onsets.
 const FLOOR: f64 = 1e-3;
 /// Lags that are examined closely: the coarse search may prefer a neighbour of the right one.
 const CANDIDATES: usize = 4;
-/// Candidates are so many seconds apart.
+/// Candidates are this many seconds apart.
 const CANDIDATE_GAP: f64 = 0.05;
-/// Tracks share at least so many seconds.
+/// Tracks share at least this many seconds.
 const MIN_OVERLAP: f64 = 1.5;
-/// Seconds around a coarse lag in which the fine one lies.
+/// Seconds around a coarse lag that contain the fine one.
 const FINE_RANGE: f64 = 0.2;
 /// Frequencies that the waveform is compared at, Hz: below, rooms boom; above, codecs save.
 const FINE_BAND: [f64; 2] = [200.0, 6000.0];
@@ -38,13 +39,13 @@ const AGREEING: usize = 3;
 const AGREEING_PART: f64 = 0.6;
 /// Largest median absolute deviation of those that agree, seconds.
 const MAX_MAD: f64 = 3e-3;
-/// Windows over at least so many seconds are needed to measure a drift of the clocks.
+/// Windows over at least this many seconds are needed to measure a drift of the clocks.
 const DRIFT_SPAN: f64 = 60.0;
 /// Largest drift of clocks, seconds a second: crystals of phones are within 100 ppm of each other.
 const MAX_DRIFT: f64 = 500e-6;
 /// Smallest uncertainty that is claimed, seconds: a sixteenth of a sample is an illusion.
 const MIN_SIGMA: f64 = 1e-4;
-/// Metres that sound goes in a second, in air of 20 °C.
+/// Speed of sound, metres per second, in air of 20 °C.
 const SPEED: f64 = 343.0;
 
 /// A lag that was heard.
@@ -52,7 +53,7 @@ const SPEED: f64 = 343.0;
 pub(crate) struct SoundLag {
     /// Seconds that the second track is late, at [`at`](Self::at).
     pub seconds: f64,
-    /// The standard deviation of it, seconds, without the way of sound.
+    /// The standard deviation of it, seconds, without the travel time of sound.
     pub sigma: f64,
     /// A second of the first track's clock in the middle of what was compared.
     pub at: f64,
@@ -71,13 +72,13 @@ impl SoundLag {
     }
 }
 
-/// A lag without the way of sound: what was heard `lag` later by b than by a comes from a source that is so many metres from
-/// either.
+/// A lag corrected for the travel time of sound: b records the source `lag` later than a, and the source has these
+/// distances from either.
 pub(crate) fn without_way(lag: f64, [from_a, from_b]: [f64; 2]) -> f64 {
     lag - (from_b - from_a) / SPEED
 }
 
-/// Seconds that the way of sound may make between cameras that are at most so many metres apart.
+/// Largest travel time of sound between cameras at this distance in metres, seconds.
 pub(crate) fn way(metres: f64) -> f64 {
     metres / SPEED
 }
@@ -101,8 +102,8 @@ impl SoundTrack {
     }
 }
 
-/// How strongly sounds begin, [`ENVELOPE_RATE`] times a second: the rise of the logarithm of the energy, band by band. Zero
-/// mean.
+/// How strongly sounds begin, [`ENVELOPE_RATE`] times a second: the rise of the logarithm of the energy, band by band.
+/// Zero mean.
 fn onsets(samples: &[f32]) -> Vec<f64> {
     let hop = (SOUND_RATE / ENVELOPE_RATE) as usize;
     let count = samples.len().saturating_sub(ENVELOPE_WINDOW) / hop;
@@ -211,7 +212,7 @@ fn candidates(a: &SoundTrack, b: &SoundTrack, most: Option<f64>) -> Vec<f64> {
 
 /// The lag near a coarse one, by the waveforms of several windows.
 fn fine(a: &SoundTrack, b: &SoundTrack, coarse: f64) -> Result<SoundLag, Refusal> {
-    // Seconds of a's clock that both have, with room for the search.
+    // Common seconds on a's clock, with a margin for the search.
     let begin = (FINE_RANGE - coarse).max(0.0);
     let end = (b.length() - FINE_RANGE - coarse).min(a.length());
     let length = ((end - begin) / (AGREEING + 1) as f64).clamp(WINDOW[0], WINDOW[1]);
@@ -257,7 +258,7 @@ fn fine(a: &SoundTrack, b: &SoundTrack, coarse: f64) -> Result<SoundLag, Refusal
     })
 }
 
-/// What a window states.
+/// Evidence of a window.
 struct Window {
     /// Its middle, on a's clock.
     at: f64,
@@ -290,7 +291,7 @@ impl Phat {
         Self { fft: Fft::new(n), length, n }
     }
 
-    /// The lag near `coarse` of the window of a that begins at second `from`, and how much its peak stands out.
+    /// The lag near `coarse` of the window of a that begins at second `from`, and the prominence of its peak.
     fn lag(&self, a: &[f32], b: &[f32], from: f64, coarse: f64) -> Option<(f64, f64)> {
         let range = (FINE_RANGE * SOUND_RATE) as isize;
         let first = (from * SOUND_RATE) as isize;

@@ -126,7 +126,7 @@ fn pairs(count: usize) -> Vec<[usize; 2]> {
 }
 
 #[test]
-fn parts_of_a_frame_follow_from_the_geometry() {
+fn sub_frame_offsets_follow_from_the_geometry() {
     for part in [0.37, -2.63] {
         let rig = Rig::new(&[0.0, -part * FRAME], 60, Dance::Free);
         let [a, b] = [0, 1].map(|c| rig.tracks(c, 20, 0.3));
@@ -243,7 +243,7 @@ fn wrong_lags_are_left_out_and_named() {
 #[test]
 fn the_trusted_kind_wins_and_guesses_come_last() {
     let mut evidence = lags(&TRUTH[..3], Kind::Geometry);
-    // Echoes: sound is wrong about one pair, and the only one to know camera 3; motion has a guess at all.
+    // Echoes: sound is wrong for one pair, and the only evidence for camera 3; motion has a guess for all.
     evidence.push(Evidence { lag: evidence[0].lag + 0.2, kind: Kind::Sound, ..evidence[0].clone() });
     evidence.push(Evidence { cameras: [3, 0], lag: 4.0, sigma: 1e-3, drift: None, kind: Kind::Sound });
     evidence.push(Evidence { cameras: [0, 1], lag: 3.0, sigma: FRAME, drift: None, kind: Kind::Motion });

@@ -6,7 +6,7 @@ use splat4d_train::capture::Rgb8;
 
 /// Pixels between corners that are followed.
 pub(crate) const APART: f64 = 8.0;
-/// Images are halved until they have no more pixels: 640x360 is looked at as it is, and a film's images at half size.
+/// Images are halved until they have no more pixels: 640x360 is used in full, and a film's images at half size.
 pub(crate) const PIXELS: usize = 700_000;
 /// Sizes of an image: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
 pub(crate) const LEVELS: usize = 4;
@@ -15,10 +15,10 @@ const RADIUS: usize = 6;
 /// Steps of Newton's method at a level, and the one that is small enough, pixels.
 const STEPS: usize = 20;
 const SMALL_STEP: f64 = 0.01;
-/// A corner is followed there and back; it is lost where it returns farther than this from where it was, pixels.
+/// A corner is tracked forward and backward; it is lost where it returns farther than this from where it was, pixels.
 const ROUND_TRIP: f64 = 0.7;
-/// The least eigenvalue of a corner's gradient matrix (mean over its window, of values from 0 to 1): a step of a twentieth
-/// across the window.
+/// The least eigenvalue of a corner's gradient matrix (mean over its window, of values from 0 to 1): a step of a
+/// twentieth across the window.
 const LEAST_EIGENVALUE: f64 = 2e-5;
 /// And relative to the strongest corner's.
 const QUALITY: f64 = 0.01;
@@ -46,15 +46,16 @@ pub fn small(picture: Rgb8) -> (Rgb8, f64) {
     (out, factor)
 }
 
-/// A point that was followed: seconds and pixel positions (the first pixel's centre is at (0.5, 0.5)), in the order of time.
+/// A point that was followed: seconds and pixel positions (the first pixel's centre is at (0.5, 0.5)), in the order of
+/// time.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Track {
-    /// Time and place, frame by frame without gaps.
+    /// Time and position, frame by frame without gaps.
     pub samples: Vec<(f64, [f64; 2])>,
 }
 
 impl Track {
-    /// Where it was at a time, between its first and last: on the line between two frames.
+    /// Position at a time between its first and last: on the line between two frames.
     #[cfg(test)]
     pub(crate) fn at(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 < time);
@@ -67,11 +68,11 @@ impl Track {
         Some([a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1])])
     }
 
-    /// Where it was at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
+    /// Position at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
     ///
-    /// A line between two noisy places is less noisy half way than at either end, so that lags would be drawn to half frames (on
-    /// a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of squares everywhere (0.50
-    /// to 0.46), and blur the motion by the same third of a squared frame.
+    /// A line between two noisy positions is less noisy half way than at either end, so that lags would be biased to
+    /// half frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
+    /// squares everywhere (0.50 to 0.46), and blur the motion by the same third of a squared frame.
     pub(crate) fn smooth(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 <= time);
         let first = after.checked_sub(2)?;
@@ -96,7 +97,7 @@ impl Track {
         Some([x, y])
     }
 
-    /// The pixels between its places farthest from each other along an axis: how much it moved at least.
+    /// The pixels between its positions farthest from each other along an axis: how much it moved at least.
     pub(crate) fn extent(&self) -> f64 {
         let side = |k: usize| {
             let of = self.samples.iter().map(|s| s.1[k]);
@@ -106,7 +107,7 @@ impl Track {
     }
 }
 
-/// Weights of the samples −1, 0, 1 and 2 at a part of the way from sample 0 to 1.
+/// Weights of the samples −1, 0, 1 and 2 at a fraction between samples 0 and 1.
 fn b_spline(u: f64) -> [f64; 4] {
     let v = 1.0 - u;
     let (u2, v2) = (u * u, v * v);
@@ -186,8 +187,8 @@ fn smaller_eigenvalue([xx, xy, yy]: [f64; 3]) -> f64 {
     0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
 }
 
-/// Where points of image a are in image b; None where they are lost: they left, nothing there is like them, or they do
-/// not come back when followed the other way.
+/// Positions of points of image a in image b; None where they are lost: they left, nothing there is like them, or they
+/// do not return to the start when tracked backwards.
 pub fn follow(a: &Pyramid, b: &Pyramid, points: &[[f64; 2]]) -> Vec<Option<[f64; 2]>> {
     let both = |&p: &[f64; 2]| {
         let there = step(a, b, p)?;
@@ -213,8 +214,8 @@ fn step(a: &Pyramid, b: &Pyramid, point: [f64; 2]) -> Option<[f64; 2]> {
     ((0.0..width).contains(&out[0]) && (0.0..height).contains(&out[1])).then_some(out)
 }
 
-/// The motion of a window at one size, by Newton's method on the squared difference; windows' means are taken off, so that
-/// light may change. None: no corner, or at the finest size something else.
+/// The motion of a window at one size, by Newton's method on the squared difference; windows' means are taken off, so
+/// that light may change. None: no corner, or at the finest size something else.
 fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: bool) -> Option<[f64; 2]> {
     const SIDE: usize = 2 * RADIUS + 1;
     const COUNT: f64 = (SIDE * SIDE) as f64;
@@ -274,7 +275,7 @@ fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: b
     Some(moved)
 }
 
-/// Follows corners through a camera's frames; where some are lost, new ones are looked for.
+/// Follows corners through a camera's frames; where some are lost, new ones are detected.
 pub(crate) struct Tracker {
     most: usize,
     apart: f64,
@@ -314,7 +315,7 @@ impl Tracker {
     }
 
     fn end(&mut self, track: Track) {
-        /// Frames that a corner must last: fewer say little of its motion, and much of what is wrong with it.
+        /// Frames that a corner must last: fewer carry little information about its motion, and mostly noise.
         const SHORTEST: usize = 4;
         if track.samples.len() >= SHORTEST {
             self.done.push(track);
@@ -358,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_are_followed_to_parts_of_a_pixel() {
+    fn corners_are_tracked_to_sub_pixel_accuracy() {
         let still = picture([0.0; 2], 1.0);
         let found = corners(&still, None, 40, 6.0, &[]);
         assert!(found.len() >= 15, "{}", found.len());
@@ -392,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn what_vanishes_is_lost() {
+    fn vanished_corners_are_lost() {
         let still = picture([0.0; 2], 1.0);
         let found = corners(&still, None, 20, 8.0, &[]);
         let mut other = still.clone();

@@ -1,5 +1,5 @@
-//! Motion JPEG in AVI without any program: what some sports cameras and most frame grabbers write. Each frame is a JPEG; the
-//! rest of the file is a list.
+//! Motion JPEG in AVI without any program: what some sports cameras and most frame grabbers write. Each frame is a
+//! JPEG; the rest of the file is a list.
 
 use super::folder::scaled;
 use super::{Color, Frame, Info, Range, Reader, Rgb8, Selection, Source, Transfer, fingerprint_of_file, fnv1a, stem};
@@ -20,13 +20,13 @@ const MAX_DEPTH: usize = 8;
 pub(super) struct Avi {
     path: PathBuf,
     info: Info,
-    /// Where each frame lies, and how long it is; a length of 0 repeats the frame before.
+    /// Position and length of each frame; a length of 0 repeats the frame before.
     frames: Vec<(u64, u32)>,
     /// Seconds a frame.
     interval: f64,
 }
 
-/// What the walk through the file has found.
+/// Result of reading the file's structure.
 #[derive(Default)]
 struct AviContents {
     /// Kind and codec of each stream, and seconds a sample.
@@ -116,7 +116,7 @@ fn info(path: &Path, interval: f64, warnings: Vec<String>) -> Info {
     }
 }
 
-/// Reads the list at a place; where the next thing begins.
+/// Reads the list at a position; returns the position after it.
 fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, depth: usize) -> std::io::Result<u64> {
     file.seek(SeekFrom::Start(at))?;
     let mut head = [0; 12];
@@ -155,7 +155,7 @@ fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, 
             }
             _ => {}
         }
-        // Chunks begin at even places.
+        // Chunks begin at even positions.
         place += 8 + u64::from(length) + u64::from(length % 2);
     }
     Ok((at + 8 + size + size % 2).max(at + 12))
@@ -262,7 +262,7 @@ mod tests {
         let path = folder.path().join("film.avi");
         std::fs::write(&path, bytes).unwrap();
         let opened = open_with(&path, 30.0, Err(Error::input("there is no ffmpeg")))?;
-        // Frames are read when they are asked for.
+        // Frames are read when they are requested.
         std::mem::forget(folder);
         Ok(opened)
     }

@@ -1,19 +1,21 @@
 //! Recordings that a camera cuts into several files: GoPro's chapters (`GX010012.MP4`, `GX020012.MP4` …) as one source.
 //!
-//! Source: GoPro, "Camera File Naming Convention" (HERO6 and later: `GX` HEVC or `GH` AVC, two digits of the chapter, four of
-//! the recording; before: `GOPR` and the recording, then `GP`, chapter, recording; `GL` is the small copy of a chapter).
+//! Source: GoPro, "Camera File Naming Convention" (HERO6 and later: `GX` HEVC or `GH` AVC, two digits of the chapter,
+//! four of the recording; before: `GOPR` and the recording, then `GP`, chapter, recording; `GL` is the small copy of a
+//! chapter).
 
 use super::{Frame, Info, Reader, SOUND_RATE, Selection, Source, fnv1a, open};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A part of this many frame intervals at a chapter's end is not searched for: rounding decides whether a frame is in it.
+/// A part of this many frame intervals at a chapter's end is not searched for: rounding decides whether a frame is in
+/// it.
 const END_FRAMES: f64 = 2.0;
 
 /// Which part of which recording a file is, by its name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Chapter {
-    /// What all chapters of the recording share: `GX0012`.
+    /// Common part of the chapters' names: `GX0012`.
     pub recording: String,
     /// The chapter, from 1 on.
     pub number: u32,
@@ -108,7 +110,7 @@ impl Joined {
         self.info.average_rate.or(self.info.nominal_rate).map_or(0.0, |r| 1.0 / r)
     }
 
-    /// What of part `i` a selection wants: on the part's clock, every frame; none: nothing.
+    /// The part of chapter `i` that a selection needs: on the part's clock, every frame; none: nothing.
     fn wanted(&self, i: usize, selection: &Selection) -> Option<Selection> {
         let start = self.starts[i];
         let end = self.starts.get(i + 1).copied().or(self.info.duration).unwrap_or(f64::INFINITY);
@@ -162,7 +164,7 @@ struct Pages<'a> {
     next: usize,
     open: Option<Open<'a>>,
     times: Vec<f64>,
-    /// Frames of the chosen part so far.
+    /// Frames read of the chosen part.
     counted: usize,
     warnings: Vec<String>,
 }
@@ -222,7 +224,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gopros_names_are_known() {
+    fn gopro_chapter_names_are_recognised() {
         let of = |name: &str| Chapter::of(Path::new(name)).map(|c| (c.recording, c.number, c.copy));
         assert_eq!(of("a/GX020012.MP4"), Some(("GX0012".into(), 2, false)));
         assert_eq!(of("gh010345.mp4"), Some(("GH0345".into(), 1, false)));
@@ -239,9 +241,9 @@ mod tests {
         assert!(missing(&paths(&["GX010012.MP4", "GX030012.MP4"])).unwrap().contains("Chapter 2"));
     }
 
-    /// Folders of images stand for chapters.
+    /// Folders of images represent chapters.
     #[test]
-    fn chapters_are_one_clock() {
+    fn chapters_share_one_clock() {
         let dir = tempfile::tempdir().unwrap();
         let paths: Vec<PathBuf> = (0..2).map(|k| dir.path().join(format!("part{k}"))).collect();
         for (k, path) in paths.iter().enumerate() {

@@ -1,10 +1,10 @@
-//! What the times of a video's frames show: its rate, whether it varies, frames that are missing or there twice.
+//! Findings from the times of a video's frames: its rate, whether it varies, missing and duplicate frames.
 
 use super::Rgb8;
 
-/// An interval above so many medians is one that a frame is missing in.
+/// An interval above this many medians is one that a frame is missing in.
 const DROPPED: f64 = 1.5;
-/// An interval below so many medians is one that a frame was put in a second time.
+/// An interval below this many medians is one that a frame was put in a second time.
 const DOUBLED: f64 = 0.25;
 /// Two images whose samples differ by less than this on average (of 255) are one image: codecs repeat a frame without a
 /// bit of change, sensors never do.
@@ -17,11 +17,11 @@ const SAME_PART: f64 = 0.2;
 /// half
 /// differ by nothing.
 const MOST: f64 = 0.75;
-/// Where most images differ by less than this, nothing moves, and nothing is doubled.
+/// If most images differ by less than this, there is no motion, and no frame counts as doubled.
 const STILL: f64 = 0.02;
 /// Intervals that differ from the median by more than this part of it vary.
 const VARIES: f64 = 0.1;
-/// The part of the intervals that must vary, gaps left out, before the rate is said to.
+/// The part of the intervals that must vary, gaps left out, before the rate is reported as variable.
 const VARIABLE_FROM: f64 = 0.05;
 
 /// Frames that are missing.
@@ -40,7 +40,7 @@ pub struct Clock {
     pub interval: f64,
     /// Whether intervals differ without frames missing.
     pub variable: bool,
-    /// Where frames are missing.
+    /// Positions of missing frames.
     pub dropped: Vec<Gap>,
     /// Numbers of frames that show the one before again.
     pub doubled: Vec<usize>,
@@ -85,7 +85,7 @@ impl Clock {
         clock
     }
 
-    /// Frames per second, as the median interval has them; 0 where there are fewer than two frames.
+    /// Frames per second, from the median interval; 0 where there are fewer than two frames.
     pub(crate) fn rate(&self) -> f64 {
         if self.interval > 0.0 { 1.0 / self.interval } else { 0.0 }
     }
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn an_even_clock_has_no_finding() {
-        // Times in whole milliseconds, as Matroska has them.
+        // Times in whole milliseconds, as in Matroska.
         let even: Vec<f64> = (0..90).map(|i| (f64::from(i) / 29.97 * 1000.0).round() / 1000.0).collect();
         let clock = Clock::of(&even, &(1..90).map(|i| (i, 2.0)).collect::<Vec<_>>());
         assert_eq!((clock.variable, clock.still, clock.missing(), clock.doubled.len()), (false, false, 0, 0));
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_varies_is_no_loss() {
+    fn a_variable_rate_is_not_a_lost_frame() {
         let uneven: Vec<f64> = (0..60).map(|i| (f64::from(i) + 0.2 * f64::from(i % 3)) / 30.0).collect();
         let clock = Clock::of(&uneven, &[]);
         assert!(clock.variable && clock.dropped.is_empty() && clock.doubled.is_empty());
@@ -142,7 +142,7 @@ mod tests {
         let even = times(&(0..20).map(f64::from).collect::<Vec<_>>());
         let moving: Vec<(usize, f64)> = (1..20).map(|i| (i, if i % 5 == 0 { 0.1 } else { 3.0 })).collect();
         assert_eq!(Clock::of(&even, &moving).doubled, [5, 10, 15]);
-        // Every other frame twice; little that moves; nothing that does.
+        // Every other frame twice; little motion; no motion.
         let other: Vec<(usize, f64)> = (1..20).map(|i| (i, if i % 2 == 0 { 0.01 } else { 0.2 })).collect();
         assert_eq!(Clock::of(&even, &other).doubled, [2, 4, 6, 8, 10, 12, 14, 16, 18]);
         let little: Vec<(usize, f64)> = (1..20).map(|i| (i, 0.1 + 0.005 * i as f64)).collect();

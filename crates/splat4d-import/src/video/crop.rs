@@ -50,13 +50,14 @@ impl Crop {
 /// Which parts of images are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cropping {
-    /// What black bars leave, found for every camera.
+    /// The area inside black bars, found for every camera.
     Auto,
     /// The same rectangle of every camera.
     At(Crop),
 }
 
-/// Finds what black bars leave of a source's images; `None`: there are none. Dark content is hardly ever dark in all examined frames.
+/// Finds what black bars leave of a source's images; `None`: there are none. Dark content is hardly ever dark in all
+/// examined frames.
 ///
 /// Errors: those of reading.
 pub(crate) fn without_bars(source: &dyn Source, selection: &Selection) -> Result<Option<Crop>> {

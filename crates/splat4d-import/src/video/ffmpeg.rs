@@ -7,7 +7,7 @@ use super::{Frame, Info, Reader, SOUND_RATE, Selection, Source, fingerprint_of_f
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
-/// Seconds before the first wanted frame where reading begins, so that rounding does not lose it.
+/// Seconds before the first requested frame where reading begins, so that rounding does not lose it.
 const SEEK_MARGIN: f64 = 1e-3;
 /// A time stamp is this exact: a tick of the coarsest usual clocks (Matroska's) is a millisecond.
 const STAMP_ERROR: f64 = 0.6e-3;
@@ -28,7 +28,7 @@ pub(super) struct Video {
 }
 
 impl Video {
-    /// Asks ffprobe what it is.
+    /// Probes it with ffprobe.
     pub(super) fn open(path: &Path, tools: Tools) -> Result<Self> {
         let json = tools.probe(path)?;
         let mut probe = probe::parse(&json, stem(path)).map_err(|e| e.at(path.display()))?;
@@ -71,12 +71,12 @@ impl Source for Video {
         }
         let seek = selection.from.map_or(0.0, |from| (from - SEEK_MARGIN).max(0.0));
         if seek > 0.0 {
-            // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the file, and those of
-            // AVI are whole frames.
+            // Its own clock is kept: shifted to the position that was sought, time stamps are rounded to ticks of the
+            // file, and those of AVI are whole frames.
             input.extend(["-copyts".into(), "-start_at_zero".into(), "-ss".into(), format!("{seek:.6}")]);
         }
         if let Some(to) = selection.to {
-            // The program rounds this end to ticks of the file too; what it gives too much is left out below.
+            // The program rounds this end to ticks of the file too; surplus frames are left out below.
             input.extend(["-t".into(), format!("{:.6}", to - seek + END_FRAMES * self.interval())]);
         }
         let mut output = vec!["-map".into(), format!("0:{}", self.probe.picture), "-vf".into(), text];
@@ -148,7 +148,7 @@ struct Pictures<'a> {
     told: usize,
     /// How many were given away.
     given: usize,
-    /// Pixels with alpha, as they come.
+    /// Raw pixels with alpha.
     raw: Vec<u8>,
     warnings: Vec<String>,
     done: bool,
@@ -157,7 +157,7 @@ struct Pictures<'a> {
 }
 
 impl Pictures<'_> {
-    /// The time of the next frame that was kept; times of all frames are noted on the way. None: ffmpeg has ended.
+    /// The time of the next frame that was kept; times of all frames are recorded. None: ffmpeg has ended.
     fn next_stamp(&mut self) -> Option<f64> {
         loop {
             let (which, time) = self.running.stamps.recv().ok()?;

@@ -12,7 +12,7 @@ const WHITE: u32 = 100;
 pub(super) struct Chain {
     /// As `-vf` takes it.
     pub text: String,
-    /// Size of the frames that come out.
+    /// Size of the output frames.
     pub size: [usize; 2],
     /// A sentence each.
     pub warnings: Vec<String>,
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn times_come_before_and_after_the_choice() {
+    fn frame_times_are_read_before_and_after_selection() {
         let selection = Selection { every: 3, size: Some(540), ..Selection::default() };
         let chain = chain(&info(), &selection, true);
         assert_eq!(chain.size, [960, 540]);

@@ -19,7 +19,7 @@ pub(crate) struct Folder {
 }
 
 impl Folder {
-    /// Looks what is there; reads the first image for its size. Images are `1/fps` seconds apart, and further where
+    /// Lists the folder; reads the first image for its size. Images are `1/fps` seconds apart, and further where
     /// numbers are missing.
     ///
     /// Errors: no images, a frame rate that is none, a damaged first image.
@@ -108,7 +108,7 @@ struct Pictures<'a> {
     folder: &'a Folder,
     selection: Selection,
     next: usize,
-    /// Images of the chosen part so far.
+    /// Images read of the chosen part.
     counted: usize,
     times: Vec<f64>,
 }
@@ -153,7 +153,7 @@ impl Reader for Pictures<'_> {
     }
 }
 
-/// An image in the size that was asked for.
+/// An image in the requested size.
 pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     let [width, height] = selection.scaled([picture.width, picture.height]);
     let picture = match selection.crop {
@@ -173,7 +173,7 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     Rgb8 { width, height, data }
 }
 
-/// An alpha channel in the size that was asked for.
+/// An alpha channel in the requested size.
 fn scaled_plane(alpha: Vec<u8>, size: [usize; 2], selection: &Selection) -> Vec<u8> {
     let [width, height] = selection.scaled(size);
     let (alpha, size) = match selection.crop {
@@ -215,8 +215,7 @@ fn natural(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// How many intervals each image comes after the first: by the last numbers in the names where they ascend evenly
-/// but for
+/// Number of intervals of each image after the first: by the last numbers in the names where they ascend evenly but for
 /// some that are missing, else by position.
 fn steps(names: &[String]) -> Vec<f64> {
     let by_position = || (0..names.len()).map(|i| i as f64).collect();
@@ -231,7 +230,7 @@ fn steps(names: &[String]) -> Vec<f64> {
     let Some(numbers) = names.iter().map(number).collect::<Option<Vec<f64>>>() else { return by_position() };
     let gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
     let least = gaps.iter().copied().fold(f64::INFINITY, f64::min);
-    // Where most steps differ from one another, numbers say nothing of time.
+    // Where most steps differ from one another, numbers carry no information about time.
     let even = gaps.iter().filter(|g| **g == least).count() * 2 >= gaps.len();
     if gaps.is_empty() || least <= 0.0 || !even || gaps.iter().any(|g| (g / least).fract() != 0.0) {
         return by_position();
@@ -248,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_in_names_are_the_clock() {
+    fn numbers_in_names_give_frame_times() {
         assert_eq!(steps(&names(&["f0005", "f0006", "f0008", "f0009"])), [0.0, 1.0, 3.0, 4.0]);
         assert_eq!(steps(&names(&["a_010", "a_020", "a_040"])), [0.0, 1.0, 3.0]);
         assert_eq!(steps(&names(&["IMG_3", "IMG_17", "IMG_20"])), [0.0, 1.0, 2.0]);

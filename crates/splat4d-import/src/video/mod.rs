@@ -28,20 +28,20 @@ pub use splat4d_train::capture::Rgb8;
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
-/// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above twice
-/// the highest frequency that sound is compared at.
+/// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above
+/// twice the highest frequency that sound is compared at.
 pub(crate) const SOUND_RATE: f64 = 16_000.0;
 
 /// Which frames of a source, and how large.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Selection {
-    /// Every so many frames, from the first one on; at least 1.
+    /// Every n frames, from the first one on; at least 1.
     pub every: usize,
     /// No frame before this second of the source's clock.
     pub from: Option<f64>,
     /// No frame at or after this second.
     pub to: Option<f64>,
-    /// Pixels of the shorter side; smaller images stay as they are.
+    /// Pixels of the shorter side; smaller images are kept.
     pub size: Option<usize>,
     /// Whether interlaced videos are taken, and their lines filled in.
     pub deinterlace: bool,
@@ -60,7 +60,7 @@ impl Selection {
     pub(crate) fn check(&self) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy));
         if self.every == 0 {
-            return bad("every 0th frame is asked for".into(), "Take every frame (1), every second (2) and so on.");
+            return bad("every 0th frame was requested".into(), "Take every frame (1), every second (2) and so on.");
         }
         if self.size.is_some_and(|s| s < MIN_SIDE) {
             return bad(format!("images of less than {MIN_SIDE} pixels are requested"), "Take 1080, for example.");
@@ -76,7 +76,7 @@ impl Selection {
         if let (Some(from), Some(to)) = (self.from, self.to)
             && from >= to
         {
-            return bad(format!("the part from {from} s to {to} s is empty"), "Let the end come after the beginning.");
+            return bad(format!("the part from {from} s to {to} s is empty"), "Give an end after the beginning.");
         }
         Ok(())
     }
@@ -87,7 +87,7 @@ impl Selection {
         self.crop.map_or(Ok(()), |crop| crop.check(info.size))
     }
 
-    /// The size that images of `size` get: cropped, their shorter side as asked for.
+    /// The size that images of `size` get: cropped, their shorter side as requested.
     pub(crate) fn scaled(&self, size: [usize; 2]) -> [usize; 2] {
         let [width, height] = self.crop.map_or(size, |c| [c.width, c.height]);
         match self.size {
@@ -134,22 +134,22 @@ pub struct Frame {
 
 /// Frames in the order of time, one in memory at a time.
 pub trait Reader {
-    /// The next chosen frame, in the place of the last one; false at the end.
+    /// The next chosen frame, in place of the last one; false at the end.
     ///
     /// Errors: nothing can be decoded at all, an image is damaged or of another size. What can be decoded in part ends
     /// early, and a warning states so.
     fn next(&mut self, frame: &mut Frame) -> Result<bool>;
 
-    /// Times of all frames passed so far, chosen or not, seconds, ascending.
+    /// Times of all frames read, chosen or not, seconds, ascending.
     fn times(&self) -> &[f64];
 
-    /// What was odd so far, a sentence or two each.
+    /// Remarks on the input, a sentence or two each.
     fn warnings(&self) -> &[String];
 }
 
-/// What images come from.
+/// Source of images.
 pub trait Source: Send + Sync {
-    /// What it is.
+    /// Its kind.
     fn info(&self) -> &Info;
 
     /// Its frames. Errors: nonsense in the selection, interlaced, a program that cannot be started.
@@ -159,7 +159,7 @@ pub trait Source: Send + Sync {
     /// there is none.
     fn sound(&self) -> Result<Option<Vec<f32>>>;
 
-    /// What changes when the contents do: 16 hexadecimal digits.
+    /// Fingerprint of the content: 16 hexadecimal digits.
     fn fingerprint(&self) -> Result<String>;
 }
 
@@ -202,7 +202,7 @@ fn stem(path: &Path) -> String {
 /// Distinguishes two files: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
 fn fingerprint_of_file(path: &Path) -> Result<u64> {
     use std::io::{Read, Seek, SeekFrom};
-    /// Bytes of each of the three places: a video's tables and some of its images.
+    /// Bytes of each of the three positions: a video's tables and some of its images.
     const PIECE: u64 = 64 << 10;
     let fail = |e| Error::io("cannot be read", e).at(path.display());
     let mut file = splat4d_train::files::open(path)?;

@@ -1,11 +1,11 @@
-//! What a video is, as ffprobe reports it.
+//! Properties of a video from ffprobe.
 
 use super::program::ratio;
 use serde_json::Value;
 use splat4d::{Error, ErrorKind, Result};
 
-/// Lines from which on an untagged video is taken for high definition, and its colours for BT.709 (as players do); below
-/// they are BT.601.
+/// Lines from which on an untagged video is taken for high definition, and its colours for BT.709 (as players do);
+/// below they are BT.601.
 const HD_LINES: usize = 720;
 /// Pixels across from which on it is, for wide images of fewer lines.
 const HD_COLUMNS: usize = 1280;
@@ -30,7 +30,7 @@ pub enum Transfer {
     Pq,
 }
 
-/// What a video's numbers mean.
+/// Colour interpretation of a video.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Color {
     /// The matrix from luma and chroma to RGB, as ffmpeg names it; None: the file holds RGB or grey.
@@ -51,14 +51,14 @@ impl Info {
     }
 }
 
-/// What a source is.
+/// Properties of a source.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Info {
     /// A name for its camera: the file's or folder's, without an ending.
     pub name: String,
     /// Pixels across and down of its frames: upright, square pixels.
     pub size: [usize; 2],
-    /// Pixels across and down as they are stored.
+    /// Pixels across and down as stored.
     pub stored: [usize; 2],
     /// Degrees by which stored images are turned clockwise.
     pub rotation: i32,
@@ -78,17 +78,17 @@ pub struct Info {
     pub pixels: String,
     /// Whether a frame is two half images of different times.
     pub interlaced: bool,
-    /// What its numbers mean.
+    /// Colour interpretation.
     pub color: Color,
     /// Whether there is sound.
     pub sound: bool,
     /// Whether pixels may be transparent.
     pub alpha: bool,
-    /// What was assumed or is odd, a sentence each.
+    /// Assumptions and remarks, a sentence each.
     pub warnings: Vec<String>,
 }
 
-/// What a probe found, and where.
+/// Result of a probe, and its path.
 #[derive(Debug)]
 pub(super) struct Probe {
     pub info: Info,
@@ -118,7 +118,7 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let text = |key: &str| film[key].as_str().unwrap_or("");
     let codec = text("codec_name").to_owned();
     if codec.is_empty() || codec == "unknown" || codec == "none" {
-        let what = format!("ffmpeg does not know its codec ({})", text("codec_tag_string"));
+        let what = format!("ffmpeg does not support its codec ({})", text("codec_tag_string"));
         return Err(Error::new(ErrorKind::Unsupported, what)
             .remedy("Convert it with the camera maker's program to H.264 in mp4."));
     }
@@ -236,7 +236,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    /// What a telephone writes, with `change`.
+    /// Output for a phone's video, with `change`.
     fn phone(change: impl FnOnce(&mut Value)) -> Value {
         let mut film = json!({
             "index": 0, "codec_type": "video", "codec_name": "hevc", "width": 1920, "height": 1080,
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_telephone_held_upright() {
+    fn a_rotated_phone_video_is_probed() {
         let sound = json!({"index": 1, "codec_type": "audio", "codec_name": "aac"});
         let found = probe(&[phone(|_| ()), sound]).unwrap();
         let info = &found.info;
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn high_dynamic_range_and_interlace_are_seen() {
+    fn high_dynamic_range_and_interlace_are_detected() {
         let hlg = phone(|f| {
             f["color_transfer"] = json!("arib-std-b67");
             f["color_space"] = json!("bt2020nc");
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn alpha_is_seen_in_formats_and_marks() {
+    fn alpha_is_detected_by_format_and_flag() {
         let of = |codec: &str, pixels: &str, mark: bool| {
             let film = phone(|f| {
                 (f["codec_name"], f["pix_fmt"]) = (json!(codec), json!(pixels));
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_that_are_not_square_and_durations_elsewhere() {
+    fn non_square_pixels_and_other_durations_are_read() {
         let film = phone(|f| {
             (f["width"], f["height"], f["sample_aspect_ratio"]) = (json!(1440), json!(1080), json!("4:3"));
             f.as_object_mut().unwrap().remove("side_data_list");
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_used_is_refused_with_a_reason() {
+    fn unusable_videos_are_refused_with_a_reason() {
         let cover = phone(|f| f["disposition"]["attached_pic"] = json!(1));
         let sound = json!({"index": 1, "codec_type": "audio", "codec_name": "aac"});
         for (streams, word) in [

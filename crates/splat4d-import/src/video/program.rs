@@ -1,4 +1,4 @@
-//! The programs ffmpeg and ffprobe: found, asked what they can do, started without a shell.
+//! The programs ffmpeg and ffprobe: search, supported features, start without a shell.
 
 use splat4d::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 /// How to install what is missing.
 const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget \
                        install ffmpeg (Windows). Or extract the frames elsewhere and give folders of images.";
-/// The first version that knows `-fps_mode`; the older name is gone from newer ones.
+/// The first version with `-fps_mode`; newer ones lack the older name.
 const FPS_MODE_SINCE: (u32, u32) = (5, 1);
 /// The first version whose `showinfo` can leave out checksums, and the oldest that is used.
 const OLDEST: (u32, u32) = (4, 3);
@@ -35,12 +35,12 @@ pub struct Tools {
 }
 
 impl Tools {
-    /// Looks for the programs where the system looks for programs. Errors: not there, too old.
+    /// Searches the programs in the system's search path. Errors: missing, too old.
     pub(crate) fn find() -> Result<Self> {
         Self::at(Path::new("ffmpeg"), Path::new("ffprobe"))
     }
 
-    /// Takes the programs from these places.
+    /// Takes the programs from these folders.
     pub(crate) fn at(ffmpeg: &Path, ffprobe: &Path) -> Result<Self> {
         let ask = |program: &Path, arguments: &[&str]| {
             let mut command = Command::new(program);
@@ -76,7 +76,7 @@ impl Tools {
         out.is_ok_and(|out| String::from_utf8_lossy(&out.stdout).lines().any(named))
     }
 
-    /// What ffprobe reports of a file, as JSON. Errors: nothing that it knows, damage.
+    /// Output of ffprobe for a file, as JSON. Errors: an unsupported file, damage.
     pub(super) fn probe(&self, path: &Path) -> Result<String> {
         let mut command = Command::new(&self.ffprobe);
         command.args([
@@ -105,8 +105,8 @@ impl Tools {
         Ok(String::from_utf8_lossy(&out.stdout).into_owned())
     }
 
-    /// Starts ffmpeg on a file; `input` stands before the file's name, `output` behind it, and what it makes comes
-    /// through a pipe.
+    /// Starts ffmpeg on a file; `input` is before the file's name, `output` behind it, and what it makes comes through
+    /// a pipe.
     pub(super) fn start(&self, path: &Path, input: &[String], output: &[String]) -> Result<Running> {
         let mut command = Command::new(&self.ffmpeg);
         command.args([
@@ -135,10 +135,10 @@ impl Tools {
             while matches!(lines.read_until(b'\n', &mut line), Ok(1..)) {
                 let text = String::from_utf8_lossy(&line);
                 if let Some((which, time)) = stamp(&text, &mut units) {
-                    // The receiver may be gone.
+                    // The receiver may be dropped.
                     let _ = send.send((which, time));
                 } else if text.contains(MUXER) {
-                    // It frets over the times of raw images, which go nowhere.
+                    // It warns about the times of raw images, which are not used.
                 } else if text.contains("[error]") || text.contains("[fatal]") {
                     said.add(plain(&text, &name));
                 }
@@ -157,7 +157,7 @@ fn file(path: &Path) -> OsString {
     name
 }
 
-/// What ffmpeg complained about.
+/// Warnings of ffmpeg.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Said {
     /// The first complaints.
@@ -188,7 +188,7 @@ impl Said {
     }
 }
 
-/// Which of the two places in the chain of filters printed a time: all frames, or those that are kept.
+/// Which of the two points in the chain of filters printed a time: all frames, or those that are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stamp {
     All,
@@ -219,7 +219,7 @@ impl Running {
         done
     }
 
-    /// Waits for the end: whether all went well, and what was said.
+    /// Waits for the end: whether it succeeded, and its messages.
     pub(super) fn finish(&mut self) -> (bool, Said) {
         let well = self.child.wait().is_ok_and(|s| s.success());
         let said = self.listener.take().and_then(|l| l.join().ok()).unwrap_or_default();
@@ -247,7 +247,8 @@ fn version(text: &str) -> Option<(u32, u32)> {
 
 /// The time in a line of one of our two `showinfo` filters:
 /// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are the unit of time stamps, printed before:
-/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long recordings.)
+/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long
+/// recordings.)
 fn stamp(line: &str, units: &mut [Option<f64>; 2]) -> Option<(Stamp, Option<f64>)> {
     let rest = line.strip_prefix("[showinfo@")?;
     let which = match rest.split(' ').next()? {
@@ -328,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_comes_with_how_to_install_it() {
+    fn a_missing_program_is_reported_with_install_instructions() {
         let error = Tools::at(Path::new("no-such-program-here"), Path::new("ffprobe")).unwrap_err().to_string();
         assert!(["apt install", "brew install", "winget install"].iter().all(|w| error.contains(w)), "{error}");
     }

@@ -81,7 +81,7 @@ const MOVING: &str = "-f lavfi -i nullsrc=s=64x48:r=30:d=0.6,geq=lum=128+60*sin(
 const EXACT: &str = "-c:v ffv1 -pix_fmt bgr0";
 
 #[test]
-fn frames_come_with_their_times() {
+fn frames_have_their_times() {
     let Some(made) = Made::new() else { return };
     let path = made.make("-a film.mp4", &format!("{MOVING} -f lavfi -i sine=d=0.6 -c:v mpeg4 -c:a aac -f mp4"));
     let source = made.open(&path).unwrap();
@@ -129,7 +129,7 @@ fn rotated_videos_are_read_upright() {
 }
 
 #[test]
-fn colours_come_out_as_they_went_in() {
+fn colours_are_preserved() {
     let Some(made) = Made::new() else { return };
     let wanted = [200i32, 90, 40];
     let color = format!("color=0x{:02x}{:02x}{:02x}", wanted[0], wanted[1], wanted[2]);
@@ -186,7 +186,7 @@ fn a_part_has_the_times_of_the_whole() {
 }
 
 #[test]
-fn rates_that_vary_and_lost_frames_are_seen() {
+fn variable_rates_and_lost_frames_are_detected() {
     let Some(made) = Made::new() else { return };
     // Frames 5 and 6 are left out; those left keep their times.
     let lost =
@@ -216,7 +216,7 @@ fn sound_keeps_the_clock_of_the_images() {
 }
 
 #[test]
-fn what_a_truncated_video_still_has_is_read() {
+fn a_truncated_video_is_read_to_its_end() {
     let Some(made) = Made::new() else { return };
     let long = "-f lavfi -i testsrc2=s=64x48:r=30:d=1 -c:v mpeg4 -g 5 -q:v 2 -movflags +faststart";
     let path = made.make("whole.mp4", long);
@@ -230,14 +230,14 @@ fn what_a_truncated_video_still_has_is_read() {
 }
 
 #[test]
-fn what_is_no_video_is_refused_with_a_reason() {
+fn non_videos_are_refused_with_a_reason() {
     let Some(made) = Made::new() else { return };
     let path = |name: &str| made.folder.path().join(name);
     std::fs::write(path("empty.mp4"), b"").unwrap();
     std::fs::write(path("noise.mp4"), [7; 3000]).unwrap();
     made.make("sound.wav", "-f lavfi -i sine=d=0.1");
     let whole = made.make("whole.mp4", &format!("{MOVING} -c:v mpeg4"));
-    // Without its table, which stands at the end.
+    // Without its table, which is at the end.
     let bytes = std::fs::read(&whole).unwrap();
     std::fs::write(path("headless.mp4"), &bytes[..bytes.len() / 2]).unwrap();
     for (name, word) in [
@@ -266,7 +266,7 @@ fn what_is_no_video_is_refused_with_a_reason() {
 }
 
 #[test]
-fn a_reader_that_is_left_early_stops_its_program() {
+fn a_reader_closed_early_stops_its_program() {
     let Some(made) = Made::new() else { return };
     let path = made.make("long.mkv", "-f lavfi -i testsrc2=s=320x240:r=30:d=1 -c:v mpeg4");
     let source = made.open(&path).unwrap();

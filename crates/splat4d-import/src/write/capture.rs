@@ -1,4 +1,4 @@
-//! `capture.json`: what the images are, where they were taken from and when.
+//! `capture.json`: images, poses and times.
 
 use super::{Masks, Pictures};
 use crate::sync::graph::Offset;
@@ -9,19 +9,19 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Times are written to so many parts of a second: cameras' clocks are no finer, and people can read them.
+/// Times are written to this many parts of a second: cameras' clocks are no finer, and people can read them.
 const TICKS: f64 = 1e6;
 
-/// Where a camera was.
+/// Pose of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Poses {
-    /// In one place: `cam_from_world`.
+    /// One pose for all shots: `cam_from_world`.
     Fixed(Se3),
-    /// In another for every shot; shots whose place is not known are left out.
+    /// A pose for every shot; shots whose pose is not known are left out.
     Moving(Vec<Option<Se3>>),
 }
 
-/// A camera whose clock, lens and place are known.
+/// A camera whose clock, lens and position are known.
 #[derive(Clone, Debug)]
 pub struct Placed {
     /// Its images.
@@ -32,13 +32,13 @@ pub struct Placed {
     pub intrinsics: Intrinsics,
     /// Of the stored images, which are not undistorted.
     pub lens: Lens,
-    /// Where it was.
+    /// Its pose.
     pub poses: Poses,
-    /// What of its images counts.
+    /// Mask of its images.
     pub masks: Option<Masks>,
 }
 
-/// What is known of the whole recording.
+/// Data of the whole recording.
 #[derive(Clone, Debug, Default)]
 pub struct Recording {
     /// A short name; the folder's if there is none.
@@ -47,7 +47,8 @@ pub struct Recording {
     pub up: Option<[f64; 3]>,
     /// The initial cloud, from the folder on.
     pub points: Option<PathBuf>,
-    /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with care.
+    /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with
+    /// care.
     pub hold_out: Vec<String>,
     /// Anything else for those who read the file; training does not.
     pub extra: Map<String, Value>,
@@ -60,7 +61,7 @@ pub fn capture(folder: &Path, take: &Recording, cameras: &[Placed]) -> Result<Pa
     if cameras.is_empty() {
         return Err(Error::input("no camera has a known position").remedy("See the report for why."));
     }
-    // The median rate of all; each camera's own times say more.
+    // The median rate of all; each camera's own times are more accurate.
     let mut intervals: Vec<f64> = cameras.iter().map(|c| c.pictures.clock.interval).filter(|i| *i > 0.0).collect();
     intervals.sort_by(f64::total_cmp);
     let interval = intervals.get(intervals.len() / 2).copied();
@@ -128,7 +129,7 @@ fn camera(camera: &Placed) -> Result<Value> {
         Poses::Moving(all) => (0..all.len()).filter(|&k| all[k].is_some()).collect(),
     };
     if known.is_empty() {
-        return Err(place(Error::input("no place of it is known").remedy("Leave the camera out.")));
+        return Err(place(Error::input("it has no known position").remedy("Leave the camera out.")));
     }
     let times: Vec<f64> = known.iter().map(|&k| tick(pictures.shots[k].time * (1.0 + offset.rate))).collect();
     let images = if known.len() == pictures.shots.len() {

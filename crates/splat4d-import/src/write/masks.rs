@@ -23,7 +23,7 @@ pub struct Masks {
     pub fingerprint: u64,
 }
 
-/// Where the images of a camera begin in its video.
+/// Start of a camera's images in its video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Begin {
     /// The second that reading began at; none: the first frame.
@@ -34,8 +34,8 @@ pub(crate) struct Begin {
 /// camera an image
 /// `NAME.png` for the whole recording, or a folder `NAME` with one for each frame of its video, in the order of names.
 ///
-/// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted` where `stop`
-/// said so.
+/// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted`
+/// where `stop` requested it.
 pub(crate) fn masks(
     folder: &Path,
     from: &Path,
@@ -49,7 +49,7 @@ pub(crate) fn masks(
         progress.phase("masks", k, pictures.len());
         if stop() {
             return Err(Error::new(ErrorKind::Interrupted, "stopped while masks were stored")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
         out.push(camera(folder, from, p, *begin).map_err(|e| e.at(format!("camera {}", p.name)))?);
     }
@@ -107,8 +107,8 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }
 
-/// Stores a mask in a size, black and white as it is, and returns what changes with it; a file that is there is of
-/// another run and is written again.
+/// Stores a mask in a size, black and white, and returns what changes with it; a file that is there is of another run
+/// and is written again.
 fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let mask = Rgb8::read(from)?;
     let off = (mask.width * height).abs_diff(mask.height * width);

@@ -1,7 +1,7 @@
 //! Writes the capture: images of all cameras with their times, and `capture.json` (docs/capture-format.md).
 //!
-//! Images come first because poses are found in them. An interrupted folder is continued: every file is written under
-//! another name and renamed, and `pictures` records their source.
+//! Images are written first because poses are found in them. An interrupted folder is continued: every file is written
+//! under another name and renamed, and `pictures` records their source.
 
 mod capture;
 mod masks;

@@ -74,11 +74,11 @@ impl Format {
     }
 }
 
-/// What of a source is stored, and under which name.
+/// Stored part of a source, and its name.
 pub(crate) struct Clip<'a> {
     /// The camera's name; see `camera_names`.
     pub name: String,
-    /// Where frames come from.
+    /// Source of frames.
     pub source: &'a dyn Source,
     /// Which of them, on the source's own clock.
     pub selection: Selection,
@@ -100,13 +100,13 @@ pub struct Pictures {
     pub name: String,
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// The pattern of the files, from the capture's folder on; the number is the place in `shots`.
+    /// The pattern of the files, from the capture's folder on; the number is the position in `shots`.
     pub pattern: String,
     /// The frames, in the order of time.
     pub shots: Vec<Shot>,
     /// The camera's clock.
     pub clock: Clock,
-    /// What was odd, a sentence or two each.
+    /// Remarks, a sentence or two each.
     pub warnings: Vec<String>,
     /// Changes with everything that the images were made of.
     pub fingerprint: String,
@@ -155,10 +155,10 @@ pub(crate) fn camera_names(wanted: &[&str]) -> Vec<String> {
     wanted.iter().map(one).collect()
 }
 
-/// Stores the frames of all cameras below `folder`, as `images/NAME/000000.jpg` and so on. What is there already, made of the
-/// same and in the same way, is left; `stop` is asked after every few frames.
+/// Stores the frames of all cameras below `folder`, as `images/NAME/000000.jpg` and so on. What is there already, made
+/// of the same and in the same way, is kept; `stop` is called after every few frames.
 ///
-/// Errors: a source that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+/// Errors: a source that cannot be read, no space; of kind `Interrupted` if `stop` requested it.
 pub(crate) fn pictures(
     folder: &Path,
     clips: &[Clip<'_>],
@@ -181,7 +181,7 @@ pub(crate) fn pictures(
     Ok(out)
 }
 
-/// Pixels of the shorter side at which a video is looked through for transparent ones.
+/// Pixels of the shorter side for the search for transparent ones in a video.
 const LOOKED_AT: usize = 32;
 
 /// Whether any pixel of a clip is transparent: many formats have alpha, and few files use it.
@@ -262,7 +262,7 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
         }
         if stop() {
             return Err(Error::new(ErrorKind::Interrupted, "stopped while frames were stored")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
     }
     let clock = Clock::of(reader.times(), &differences);
@@ -314,10 +314,9 @@ fn read(path: &Path) -> Option<Note> {
     serde_json::from_slice(&splat4d_train::files::read(path).ok()?).ok()
 }
 
-/// Removes the images that were written into a folder of a capture before. `noted`: whether a note records such
-/// images, which
-/// captures without a list of their files go by. Errors: it holds images of such names without a note; nothing is
-/// removed then.
+/// Removes the images that were written into a folder of a capture before. `noted`: whether a note records such images,
+/// which captures without a list of their files are read by. Errors: it holds images of such names without a note;
+/// nothing is removed then.
 fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let numbered = |path: &PathBuf| {
@@ -328,7 +327,7 @@ fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     };
     let there: Vec<PathBuf> = entries.filter_map(|e| e.ok().map(|e| e.path())).filter(numbered).collect();
     let listed = written(capture);
-    // A folder that was filled before there was a list goes by its note; one of which anything is listed by the list.
+    // A folder from before lists existed is identified by its note, any other by the list.
     let inside = |file: &PathBuf| folder.strip_prefix(capture).is_ok_and(|own| file.starts_with(own));
     let noted = noted && !listed.iter().any(inside);
     let ours = |path: &PathBuf| noted || path.strip_prefix(capture).is_ok_and(|file| listed.contains(file));

@@ -1,4 +1,4 @@
-//! Captures that are written, interrupted, gone on with and read again.
+//! Captures that are written, interrupted, continued and read again.
 
 use super::*;
 use crate::sync::graph::Offset;
@@ -61,7 +61,7 @@ fn store(folder: &Path, clips: &[Clip<'_>], stop_after: usize) -> splat4d::Resul
 }
 
 #[test]
-fn what_was_interrupted_ends_in_the_same_bytes() {
+fn an_interrupted_import_ends_in_the_same_bytes() {
     let (_folder, sources) = rig();
     let clips = clips(&sources, &Selection::default());
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -95,7 +95,7 @@ fn derived_values_are_computed_again() {
     let names = contents(out.path());
     assert_eq!(names.keys().filter(|n| n.starts_with("images/cam_0") && n.ends_with("jpg")).count(), 9);
     assert!(names.contains_key("images/cam_0/mine.txt"), "files of others stay");
-    // An image that was lost comes back.
+    // A lost image is restored.
     std::fs::remove_file(out.path().join("images/cam_1/000001.jpg")).unwrap();
     store(out.path(), &clips(&sources, &half), usize::MAX).unwrap();
     assert_eq!(contents(out.path()), names);
@@ -216,7 +216,7 @@ fn masks_are_stored_next_to_their_images() {
 }
 
 #[test]
-fn the_capture_is_read_as_it_was_meant() {
+fn the_written_capture_is_read_back() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     let stored = store(out.path(), &clips(&sources, &Selection::default()), usize::MAX).unwrap();

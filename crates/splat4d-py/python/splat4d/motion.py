@@ -12,7 +12,7 @@ class Motion:
     `function(params, t)` returns the Gaussians at second t: means [N, 3], quats [N, 4] (wxyz, of any length), scales [N, 3],
     opacities [N] and, with `colors=True`, colours [N, 3] (without, the spherical harmonics are shown). `params` is a dict of
     arrays: `means` [N, 3], `quats` [N, 4], `log_scales` [N, 3], `opacity_logits` [N] and `sh` [N, K, 3] of the canonical
-    Gaussians that are asked for, and the model's own, which start at zero or as they are given: `per_gaussian` (name:
+    Gaussians that are requested, and the model's own, which start at zero or as they are given: `per_gaussian` (name:
     numbers a Gaussian), whose rows are copied and removed with the Gaussians, and `shared` (name: array).
 
     With PyTorch, `params` are tensors, and gradients come from autograd. Without, give `backward(params, t, d_means, d_quats,

@@ -59,7 +59,7 @@ async function shown(backend, made, body, { before, policy } = {}) {
       restart({});
     }, backend);
     await body(page);
-    // The browser itself says in the console what a policy forbids.
+    // The browser itself states in the console what a policy forbids.
     const wrong = errors.filter((e) => !(policy && e.includes('Content Security Policy')));
     assert.deepEqual([wrong, await page.evaluate(() => globalThis.shown.errors)], [[], []]);
   } finally {
@@ -117,7 +117,7 @@ async function compare(page, made, look, options) {
 for (const backend of ['webgl2', 'webgpu']) {
   const skip = !browser || !existsSync(`${PLAYER}${backend}.js`);
 
-  test(`${backend} draws what the reference draws`, { skip }, () => {
+  test(`${backend} renders like the reference`, { skip }, () => {
     const made = sample();
     return shown(backend, made, async (page) => {
       for (const look of looks) {
@@ -131,7 +131,7 @@ for (const backend of ['webgl2', 'webgpu']) {
     });
   });
 
-  test(`${backend} draws whom key masks admit, and nobody else`, { skip }, () => {
+  test(`${backend} renders only the Gaussians that key masks admit`, { skip }, () => {
     const made = sample({ masks: 0.5 }),
       bare = sample({ masks: 0.5, patch: (sections) => sections.filter((s) => s.kind !== 'MASK') });
     return shown(backend, made, async (page) => {
@@ -151,7 +151,7 @@ for (const backend of ['webgl2', 'webgpu']) {
     });
   });
 
-  test(`${backend} draws a page without its mask until that is there`, { skip }, () => {
+  test(`${backend} renders a page without its mask until the mask is loaded`, { skip }, () => {
     const made = sample({ masks: 0.5 }),
       unmasked = { truth: made.truth.map((g) => ({ ...g, admitted: null })) };
     return shown(backend, made, async (page) => {
@@ -178,7 +178,7 @@ for (const backend of ['webgl2', 'webgpu']) {
         await stream.settled(time);
       }, look.time);
       assert.ok((await compare(page, made, look)) >= REACHED, 'the masks came');
-      // Places that are lent again have forgotten their masks: every page is dropped and comes back without.
+      // Reused places have lost their masks: every page is dropped and loaded again without masks.
       await page.evaluate(() => {
         const { file, restart } = globalThis.shown;
         for (const entry of file.pages) entry.mask = -1;
@@ -188,7 +188,7 @@ for (const backend of ['webgl2', 'webgpu']) {
     });
   });
 
-  test(`${backend} survives pages that come and go, sizes that change and its own end`, { skip }, () => {
+  test(`${backend} survives page changes, resizes and disposal`, { skip }, () => {
     const made = sample({ seed: 9, masks: 0.3 });
     // What the fullest time needs, and no page more: every seek drops pages and lends their rows again.
     const most = 700 + 1025 + 511;
@@ -216,7 +216,7 @@ for (const backend of ['webgl2', 'webgpu']) {
 
 const skip = !browser;
 
-test('webgl2 without float targets, and without workers, draws the same', { skip }, async () => {
+test('webgl2 without float targets, and without workers, renders the same', { skip }, async () => {
   const made = sample({ masks: 0.5 });
   const poor = [
     ['half floats', REACHED, { before: () => hide('EXT_color_buffer_float') }],
@@ -247,7 +247,7 @@ test('webgl2 without float targets, and without workers, draws the same', { skip
   }
 });
 
-test('webgl2 says when the device is lost, and waits for nobody then', { skip }, () =>
+test('webgl2 reports a lost device and stops waiting', { skip }, () =>
   shown('webgl2', sample(), async (page) => {
     await picture(page, looks[0]);
     await page.evaluate(async (look) => {

@@ -1,6 +1,6 @@
-// The package in the hands of TypeScript and of bundlers: Vite (its development server and its build), webpack and esbuild. Each page must play
-// with both workers; a bundler that does not find them leaves all work to the main thread, and says nothing. Needs npm, and vite,
-// webpack and esbuild next to playwright-core (`.ci/run`).
+// The package in the hands of TypeScript and of bundlers: Vite (its development server and its build), webpack and
+// esbuild. Each page must play with both workers; a bundler that does not find them leaves all work to the main thread,
+// without a message. Needs npm, and vite, webpack and esbuild next to playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync, spawnSync } from 'node:child_process';
@@ -103,7 +103,7 @@ test('webpack', options, async () => {
   await built(out, '/main.js');
 });
 
-test('esbuild, with the workers beside its output', options, async () => {
+test('esbuild, with the workers next to its output', options, async () => {
   const out = path.join(work, 'esbuild');
   const { warnings } = await esbuild.build({
     entryPoints: [path.join(work, 'main.js')], bundle: true, minify: true, format: 'esm', splitting: true, outdir: out, logLevel: 'silent',
@@ -131,7 +131,7 @@ const tsc = (() => {
     return null;
   }
 })();
-test('the example for React has types', { skip: browser && tsc ? false : 'needs typescript and @types/react' }, () => {
+test('the React example type-checks', { skip: browser && tsc ? false : 'needs typescript and @types/react' }, () => {
   const folder = path.join(work, 'typed');
   mkdirSync(folder);
   writeFileSync(path.join(folder, 'take.tsx'), TSX());

@@ -1,5 +1,5 @@
-// Editing as people do it: the program serves a scene and a list, Chromium selects, deletes, moves, recolours, undoes and
-// saves; a page without the token only looks. SPLAT4D names the program; without it these tests are skipped.
+// Editing as people do it: the program serves a scene and a list, Chromium selects, deletes, moves, recolours, undoes
+// and saves; a page without the token only looks. SPLAT4D names the program; without it these tests are skipped.
 
 import assert from 'node:assert/strict';
 import { spawn, execFileSync } from 'node:child_process';
@@ -28,7 +28,7 @@ test.after(async () => {
 
 const near = (a, b, by = 1e-4) => a.forEach((x, i) => assert.ok(Math.abs(x - b[i]) <= by, `${a} is not ${b}`));
 
-test('selections are combined in words', () => {
+test('selections are combined as text', () => {
   assert.equal(combined('', 'all', 'add'), 'all');
   assert.equal(combined('a(1)', 'b(2)', 'new'), 'b(2)');
   assert.equal(combined('a(1)', 'b(2)', 'add'), 'a(1) or b(2)');
@@ -36,7 +36,7 @@ test('selections are combined in words', () => {
   assert.equal(combined('a(1)', 'b(2) or c(3)', 'within'), 'a(1) and (b(2) or c(3))');
 });
 
-test('a move gets keys, and is between them where it was set', () => {
+test('a move gets keys, and is interpolated between them', () => {
   const start = { do: 'move', select: 'all', to: { shift: [1, 0, 0], about: [0, 0, 1] } };
   let step = withKey(start, 0);
   assert.deepEqual([step.to, step.about], [undefined, [0, 0, 1]]);
@@ -59,7 +59,7 @@ test('the last box of a selection is read and replaced', () => {
   for (const words of ['', 'all', 'box(1,2)', 'box(1,2,3, 4,5,x)', 'sandbox(0,0,0,1,1,1)']) assert.equal(boxOf(words), null);
 });
 
-test('what was done is undone and done again', () => {
+test('edits are undone and redone', () => {
   const h = new History([]);
   h.push([1]);
   h.push([1, 2]);
@@ -120,7 +120,7 @@ async function edit(url, size = { width: 900, height: 640 }, more = {}) {
   };
 }
 
-test('a lasso over the picture deletes, undo brings it back, and the list is saved', options, async (t) => {
+test('a lasso on the image deletes, undo restores, and the list is saved', options, async (t) => {
   const list = path.join(work, 'edits.toml');
   const url = await view(KNIGHT, list);
   assert.match(url, /#edit=[0-9a-f]{32}$/);
@@ -162,7 +162,7 @@ test('a lasso over the picture deletes, undo brings it back, and the list is sav
   await page.close();
 });
 
-test('words, colours, moves by handles, keys on the time line; wrong words are said', options, async () => {
+test('selections, colours, moves by handles, keys on the time line; errors are shown', options, async () => {
   const e = await edit(await view(KNIGHT, path.join(work, 'moves.toml'))), { page, panel } = e;
   const area = panel.getByLabel('Selection as text');
   await area.fill('bux(1)');
@@ -216,7 +216,7 @@ test('words, colours, moves by handles, keys on the time line; wrong words are s
   await page.close();
 });
 
-test('fingers draw with one and look with two', options, async () => {
+test('one finger draws and two move the camera', options, async () => {
   const e = await edit(await view(KNIGHT, path.join(work, 'touch.toml')), { width: 390, height: 760 }, { hasTouch: true, isMobile: true });
   const { page } = e;
   await e.tool('Box');
@@ -242,7 +242,7 @@ test('fingers draw with one and look with two', options, async () => {
   await page.close();
 });
 
-test('without the token a page only looks, and other origins cannot ask', options, async () => {
+test('without the token a page cannot edit, and other origins cannot send requests', options, async () => {
   const url = await view(KNIGHT, path.join(work, 'none.toml')), base = url.split('#')[0];
   const page = await browser.newPage();
   await page.goto(base);
@@ -253,7 +253,7 @@ test('without the token a page only looks, and other origins cannot ask', option
   assert.equal(await status({ 'content-type': 'application/json', 'x-splat4d-token': '0'.repeat(32) }), 403);
   const token = url.split('=')[1];
   assert.equal(await status({ 'content-type': 'application/json', 'x-splat4d-token': token }), 200);
-  // Another origin on this machine, with the token: the browser asks leave and gets none.
+  // Another origin on this machine, with the token: the browser sends a preflight request, which is refused.
   const other = await view(KNIGHT, path.join(work, 'other.toml'));
   const foreign = await browser.newPage();
   await foreign.goto(other.split('#')[0]);

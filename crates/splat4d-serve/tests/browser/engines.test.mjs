@@ -1,5 +1,5 @@
-// The scene inside Spark, PlayCanvas and Babylon.js as npm delivers them, against the player's own image. Needs esbuild and the
-// engines next to playwright-core (`.ci/run`).
+// The scene inside Spark, PlayCanvas and Babylon.js as npm delivers them, against the player's own image. Needs esbuild
+// and the engines next to playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { existsSync, readFileSync } from 'node:fs';
@@ -55,7 +55,8 @@ async function bundle(text, external = null) {
 
 const exported = (names, from) => `export { ${names.join(', ')} } from '${from}';`;
 
-/// What all pages begin with. A page calls `shows` with a function that renders and returns the rows of floats, from below.
+/// What all pages begin with. A page calls `shows` with a function that renders and returns the rows of floats, from
+/// below.
 const HEAD = `const WIDTH = ${WIDTH}, HEIGHT = ${HEIGHT}, canvas = document.querySelector('canvas');
   const bytes = (floats) => {
     const out = [];
@@ -64,8 +65,8 @@ const HEAD = `const WIDTH = ${WIDTH}, HEIGHT = ${HEIGHT}, canvas = document.quer
     return out;
   };
   const pause = () => new Promise((done) => setTimeout(done, 300));
-  // Engines sort in workers, and show what was there until the order is: an image is taken that is not the one before, when
-  // three in a row are the same.
+  // Engines sort in workers, and show what was there until the order is: an image is taken that is not the one before,
+  // when three in a row are the same.
   let before = null;
   const same = (a, b) => a !== null && b !== null && a.every((x, i) => x === b[i]);
   const still = async (image) => {
@@ -241,7 +242,7 @@ async function shot(p, time) {
       c = (await SceneFile.open('/scene.s4d')).meta.cameras[0],
       m = c.world_from_camera;
     const position = [m[3], m[7], m[11]],
-      // So far ahead that the player's near plane is that of the capture's cameras.
+      // Far enough ahead that the player's near plane is that of the capture's cameras.
       target = [m[3] + 40 * m[2], m[7] + 40 * m[6], m[11] + 40 * m[10]];
     e.camera = { position, target, fov: (2 * Math.atan(c.height / 2 / c.fy) * 180) / Math.PI };
     e.seek(time);
@@ -257,7 +258,7 @@ for (const [name, [packages, script, modules]] of Object.entries(ENGINES)) {
   const missing = [...packages, 'esbuild'].filter((p) => !there(p));
   const skip = !browser ? 'needs a browser' : missing.length ? `needs ${missing.join(', ')}` : false;
   if (skip && process.env.REQUIRE_ENGINES === '1') throw new Error(`${name} ${skip}`);
-  test(`${name} shows what the player shows, sought and played, and gives its memory back`, { skip }, async (t) => {
+  test(`${name} matches the player when seeking and playing, and releases its memory`, { skip }, async (t) => {
     const body = `<canvas width="${WIDTH}" height="${HEIGHT}" style="display:block"></canvas><script type="module">${script}</script>`;
     const { page: p, errors } = await page(body, await modules(), (done) => t.after(done));
     await p.waitForFunction(() => window.shown, null, { timeout: PATIENCE }).catch((e) => assert.fail(`${e.message} ${errors}`));

@@ -1,5 +1,5 @@
-// Measures what docs/python.md and docs/player.md state of installing: from an empty folder to a scene that plays in Chromium.
-// PLAYWRIGHT=FOLDER node figures.mjs [WHEEL]; with a wheel also an environment for it, by python3.
+// Measures what docs/python.md and docs/player.md state of installing: from an empty folder to a scene that plays in
+// Chromium. PLAYWRIGHT=FOLDER node figures.mjs [WHEEL]; with a wheel also an environment for it, by python3.
 
 import { execFileSync, spawn } from 'node:child_process';
 import { mkdtempSync, readFileSync, readdirSync, rmSync, statSync } from 'node:fs';
@@ -18,7 +18,7 @@ const PLAYS = 0.1;
 const call = (program, args, cwd) => String(execFileSync(program, args, { cwd, stdio: ['ignore', 'pipe', 'ignore'] })).trim();
 const now = () => performance.now() / 1000;
 
-/// Waits until the page's scene plays; says how long it took since `begin`.
+/// Waits until the page's scene plays; states how long it took since `begin`.
 async function plays(browser, url, begin, what) {
   const { page, errors } = await open(browser, url, { viewport: { width: 400, height: 300 } });
   const started = () => document.querySelector('splat-4d')?.statistics?.firstFrame > 0;

@@ -16,7 +16,7 @@ const { KeyMask, Sorter } = globalThis.splat4dSort;
 const near = (a, b, tolerance, what) =>
   a.forEach((v, k) => assert.ok(Math.abs(v - b[k]) <= tolerance * (1 + Math.abs(b[k])), `${what} ${k}: ${v} ${b[k]}`));
 
-test('what was written is what is read, at any time', async () => {
+test('written values are read back at any time', async () => {
   const { bytes, json, truth } = sample();
   const file = await SceneFile.open(new Blob([bytes]));
   assert.equal(file.meta.gaussians, truth.length);
@@ -64,7 +64,7 @@ test('what was written is what is read, at any time', async () => {
   assert.equal(poster.size, file.sections[2].bytes);
 });
 
-test('key masks say who is drawn when', async () => {
+test('key masks select the Gaussians of a time', async () => {
   const { bytes, truth } = sample({ masks: 0.5 });
   const file = await SceneFile.open(bytes);
   let first = 0,
@@ -86,7 +86,7 @@ test('key masks say who is drawn when', async () => {
   assert.deepEqual([masked, file.pages.length], [5, 6]);
 });
 
-test('a file that was cut short behind a page shows it without its mask', async () => {
+test('a file truncated behind a page shows it without its mask', async () => {
   const { bytes } = sample({ masks: 0.5 }),
     whole = await SceneFile.open(bytes);
   const { mask } = whole.pages[0];
@@ -95,7 +95,7 @@ test('a file that was cut short behind a page shows it without its mask', async 
   await file.page(file.pages[0].id);
 });
 
-test('spans say what is drawn, and time is held inside the clip', async () => {
+test('spans select pages, and time is clamped to the clip', async () => {
   const file = await SceneFile.open(sample().bytes);
   const at = (t) => file.activePages(t).map((p) => p.id);
   assert.deepEqual(
@@ -110,7 +110,7 @@ test('spans say what is drawn, and time is held inside the clip', async () => {
   );
 });
 
-test('a server gives parts, each byte once, neighbours in one request', async () => {
+test('ranges are requested once, neighbours together', async () => {
   const { bytes } = sample({ scale: 5, codec: 0 });
   const server = await serve({ files: { 'a.s4d': bytes } });
   try {
@@ -149,7 +149,7 @@ test('a long index takes a second request', async () => {
   }
 });
 
-test('a server without ranges sends all, with progress', async () => {
+test('a server without ranges sends the whole file, with progress', async () => {
   const { bytes } = sample({ scale: 5, codec: 0 }),
     server = await serve({ files: { a: bytes }, ranges: false });
   try {
@@ -181,7 +181,7 @@ test('a connection that breaks once is tried again, one that stays broken is an 
   }
 });
 
-test('a file that was cut short is complete up to there', async () => {
+test('a truncated file is complete up to its end', async () => {
   const { bytes } = sample();
   const whole = await SceneFile.open(bytes),
     cut = whole.pages[3].offset + 10;
@@ -206,7 +206,7 @@ test('a file that grows has its index behind its sections, and reads like a fini
   await assert.rejects(SceneFile.open(growing.subarray(0, growing.length - 1)), /truncated in its index/);
 });
 
-test('hostile and foreign files are refused in words', async () => {
+test('hostile and foreign files are refused with a message', async () => {
   const base = sample().json,
     PAGE = (more) => ({
       kind: 'PAGE',
@@ -330,7 +330,7 @@ test('inflating stops at the stated size', async () => {
   await assert.rejects((await SceneFile.open(random)).page(0), /not valid/);
 });
 
-test('any changed byte is an error or the same picture, never a hang', async () => {
+test('any changed byte is an error or the same image, never a hang', async () => {
   const { bytes } = sample({ scale: 0.02, masks: 0.5 }),
     next = random(3);
   for (let n = 0; n < 400; n++) {
@@ -351,7 +351,7 @@ test('any changed byte is an error or the same picture, never a hang', async () 
   }
 });
 
-test('sorting finds everybody who is seen, the farthest first', async () => {
+test('sorting returns all visible Gaussians, the farthest first', async () => {
   const file = await SceneFile.open(sample().bytes),
     sorter = new Sorter(),
     known = new Map();

@@ -29,7 +29,7 @@ function numbers(g, i) {
   return [...three(g.position), w, x, y, z, ...three(g.scale), g.opacity[i], ...three(g.color)];
 }
 
-/// Whether Gaussian i has the wanted numbers; a rotation may have the other sign.
+/// Whether Gaussian i has the requested numbers; a rotation may have the other sign.
 function same(g, i, wanted) {
   const have = numbers(g, i),
     sign = [3, 4, 5, 6].reduce((sum, k) => sum + have[k] * wanted[k], 0) < 0 ? -1 : 1;

@@ -1,5 +1,5 @@
-// The first seconds on a slow line: the poster stays until there is an image that is like it, and the clock starts only then.
-// And a file that was cut short.
+// The first seconds on a slow line: the poster stays until there is an image that is like it, and the clock starts only
+// then. And a file that was cut short.
 
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
@@ -9,7 +9,7 @@ import { launch, open } from './browser.mjs';
 import { serve } from './server.mjs';
 
 const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.s4d', import.meta.url)));
-/// A slow phone's line: bytes a second, ms.
+/// A slow phone's line: bytes per second, ms.
 const LINE = { offline: false, latency: 150, downloadThroughput: 200_000, uploadThroughput: 100_000 };
 /// The first image against the settled one of the same time, dB: all of it, and where something moves.
 const WHOLE = 27,
@@ -29,7 +29,7 @@ async function opened(bytes, t) {
   return { page, errors, url: `${server.url}a.html` };
 }
 
-test('on a slow line the poster stays until the scene looks like it', options, async (t) => {
+test('on a slow connection the poster stays until the scene matches it', options, async (t) => {
   const { page, errors, url } = await opened(KNIGHT, t);
   const line = await page.context().newCDPSession(page);
   await line.send('Network.enable');
@@ -92,7 +92,7 @@ test('on a slow line the poster stays until the scene looks like it', options, a
   assert.deepEqual(errors, []);
 });
 
-test('a file that was cut short plays what is there, and says so', options, async (t) => {
+test('a truncated file plays what it holds, and reports it', options, async (t) => {
   const { page, url } = await opened(KNIGHT.subarray(0, 300_000), t);
   await page.addInitScript(() => {
     addEventListener('DOMContentLoaded', () =>

@@ -44,7 +44,7 @@ export function gaussian(page, entry, i) {
   };
 }
 
-/// Where Gaussian `g` is at `time`: {mean, quat, opacity: with its life; 0 where it is not drawn}.
+/// Where Gaussian `g` is at `time`: {mean, quat, opacity: with its lifespan; 0 where it is not drawn}.
 export function at(g, time) {
   const dt = time - g.center;
   const mean = g.mean.map((x, k) => x + g.velocity[k] * dt);

@@ -1,5 +1,6 @@
-// The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the element, and
-// the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core (`.ci/run`).
+// The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the
+// element, and the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core
+// (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync } from 'node:child_process';
@@ -45,7 +46,7 @@ async function page(body, t) {
   return opened;
 }
 
-test('the package holds what it names, and is small', (t) => {
+test('the package contains its exports, and is small', (t) => {
   const manifest = JSON.parse(readFileSync(path.join(installed, 'package.json')));
   const named = Object.values(manifest.exports).flatMap((e) => (typeof e === 'string' ? [] : Object.values(e)));
   // What a loader imports is in the package too.
@@ -60,7 +61,7 @@ test('the package holds what it names, and is small', (t) => {
 const needs = (three) => ({ skip: !browser ? 'needs a browser' : three && !existsSync(THREE) ? 'needs three' : false });
 const ELEMENT = `<splat-4d src="/knight.s4d" backend="webgl2" resolution="1" controls="none"
   style="display:block;width:400px;height:300px"></splat-4d><script type="module">import 'splat4d';</script>`;
-/// three.js with the knight, seen by the file's camera \`at\`; the page says \`shown\` when it is drawn.
+/// three.js with the knight, seen by the file's camera \`at\`; the page states \`shown\` when it is drawn.
 const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
   import * as THREE from 'three';
   import { Splat4D } from 'splat4d/three';
@@ -104,7 +105,7 @@ test('an installed element plays', needs(false), async (t) => {
   assert.deepEqual(errors, []);
 });
 
-test('the object in three.js shows what the element shows, among meshes', needs(true), async (t) => {
+test('the three.js object matches the element, among meshes', needs(true), async (t) => {
   const { page: p, errors } = await page(OBJECT, t);
   await p.waitForFunction(() => window.shown, null, { timeout: 60000 });
   const show = (...args) => p.evaluate((a) => window.show(...a), args);

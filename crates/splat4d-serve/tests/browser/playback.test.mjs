@@ -1,6 +1,6 @@
-// What is seen while the clock runs, against the CPU renderer at the time that the page reports: an order or an alive set of
-// another time shows as ghosts and holes. SPLAT4D names the program; without it these tests are skipped. SwiftShader is the
-// slow device on which such a delay shows.
+// What is seen while the clock runs, against the CPU renderer at the time that the page reports: an order or an alive
+// set of another time shows as ghosts and holes. SPLAT4D names the program; without it these tests are skipped.
+// SwiftShader is the slow device on which such a delay shows.
 // FRAMES names a folder that keeps the images.
 
 import assert from 'node:assert/strict';
@@ -18,7 +18,8 @@ import { PLAYER, serve } from './server.mjs';
 const BOUND = 30;
 const FRAMES = 30;
 const [WIDTH, HEIGHT] = [160, 120];
-/// Scene seconds against the wall's while it plays: frames may be few, but the clock is not late by more than a busy machine makes it.
+/// Scene seconds against the wall's while it plays: frames may be few, but the clock is not late by more than a busy
+/// machine makes it.
 const REAL_TIME = 0.3;
 
 const file = (name) => fileURLToPath(new URL(`../../../../${name}`, import.meta.url));
@@ -52,7 +53,8 @@ const element = (attributes) => `<splat-4d src="/knight.s4d" controls="none" ${a
 const ready = (p) =>
   p.waitForFunction(() => document.querySelector('splat-4d').statistics?.firstFrame > 0, null, { timeout: 60000 });
 
-/// In the page: copies `canvas` in the task that rendered it, as base64, and the 3x4 pose of its camera with its field of view.
+/// In the page: copies `canvas` in the task that rendered it, as base64, and the 3x4 pose of its camera with its field
+/// of view.
 const HELP = () => {
   globalThis.copyOf = (canvas) => {
     const { width, height } = canvas,
@@ -151,14 +153,14 @@ function pace(frames, length, speed) {
 }
 
 for (const backend of ['webgl2', 'webgpu']) {
-  test(`${backend}: every frame of a playback is one that exists`, options, async (t) => {
+  test(`${backend}: every frame of a playback exists in the file`, options, async (t) => {
     const { page: p, errors } = await page(element(`backend="${backend}" resolution="1"`), t);
     await ready(p);
     await p.evaluate(HELP);
     const length = await p.evaluate(() => ((e) => e.duration + e.player.frameTime)(document.querySelector('splat-4d')));
     const once = await grab(p, FRAMES, (e) => e.play());
     const fast = await grab(p, FRAMES, (e) => (e.player.speed = 4));
-    // From another side, and there and back, while it plays.
+    // From another side, and back, while it plays.
     const jumps = await grab(p, 6, (e) => {
       let n = 0;
       e.player.speed = 1;

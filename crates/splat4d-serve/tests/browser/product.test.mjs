@@ -110,7 +110,7 @@ function rendered(page, scene, name, time, picture) {
 }
 
 for (const backend of ['webgl2', 'webgpu']) {
-  test(`${backend} shows what the CPU renderer shows without those whom key masks hide`, options, async (t) => {
+  test(`${backend} matches the CPU renderer without the Gaussians that key masks hide`, options, async (t) => {
     const camera = { name: 'front', world_from_camera: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], width: 400, height: 300 };
     const made = { masks: 0.5, json: { cameras: [{ ...camera, fx: 375, fy: 375, cx: 200, cy: 150 }] } };
     const put = (name, options) => {
@@ -135,7 +135,7 @@ for (const backend of ['webgl2', 'webgpu']) {
     await page.close();
   });
 
-  test(`${backend} shows the bundled capture as the CPU renderer does`, options, async (t) => {
+  test(`${backend} renders the bundled capture like the CPU renderer`, options, async (t) => {
     const url = await view(KNIGHT);
     const { page, errors } = await bare(url, `backend="${backend}" resolution="1" controls="none"`);
     const named = await page.evaluate(() => document.querySelector('splat-4d').player.meta.cameras);
@@ -154,7 +154,7 @@ for (const backend of ['webgl2', 'webgpu']) {
   });
 }
 
-test('a long take starts with a fraction of its bytes, and a seek fetches its own', options, async (t) => {
+test('a long capture starts with a fraction of its bytes, and a seek fetches its own', options, async (t) => {
   const long = path.join(work, 'long.s4d');
   run('bake', KNIGHT, '-o', long, '--repeat', String(ROUNDS));
   const { page, errors } = await bare(await view(long), 'backend="webgl2" resolution="0.5" controls="none"');

@@ -53,7 +53,7 @@ function page(next, n, span, { entries = 0, scale, center, extent }) {
       shift = [0, 0, 0].map(() => Math.floor(next() * 1023));
     const turn = [0, 0, 0].map(() => Math.floor(next() * 1023)),
       rgb = [code(8), code(8), code(8)];
-    // A third lives for ever, a few have no flat part at all.
+    // A third has an infinite lifespan, a few have no flat part at all.
     const die = next(),
       wide = die < 0.33 ? 255 : die < 0.4 ? 0 : 1 + Math.floor(next() * 254),
       soft = code(8);
@@ -188,7 +188,7 @@ export function layout(json, sections, { major = 1, minor = 0 } = {}) {
   return Buffer.concat([head, index, ...bodies]);
 }
 
-/// A finished file as one that grows: its index behind its sections, or where `at` says.
+/// A finished file as one that grows: its index behind its sections, or where `at` states.
 export function grown(bytes, { at } = {}) {
   const size = bytes.readUInt32LE(12),
     out = Buffer.concat([bytes, bytes.subarray(64, 64 + size)]);

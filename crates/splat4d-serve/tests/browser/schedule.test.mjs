@@ -16,7 +16,7 @@ class Machine {
   playing = true;
   epoch = 0;
   view = VIEW;
-  /// Times that were asked for, and [now, time] of what was rendered.
+  /// Times that were requested, and [now, time] of what was rendered.
   asked = [];
   rendered = [];
   order = {
@@ -106,7 +106,7 @@ test('slow sorting goes on while frames are rendered', () => {
   assert.ok(m.rendered.length >= 36, `${m.rendered.length} of 100 frames`);
 });
 
-test('what is requested beyond the end is the beginning', () => {
+test('requests beyond the end wrap to the beginning', () => {
   const m = new Machine({ ms: 5, frame: 100 });
   m.frames(40);
   const times = m.rendered.slice(10).map(([, time]) => time);
@@ -114,7 +114,7 @@ test('what is requested beyond the end is the beginning', () => {
   // One loop lasts 1.1 s: eleven frames of 0.1 s, one of them the last frame's.
   for (const [now, time] of m.rendered.slice(10)) {
     const late = (now / 1000 - time + 1.1) % 1.1;
-    // While the last frame stands the clock runs on.
+    // The clock continues while the last frame is shown.
     assert.ok(late < 0.02 || late > 1.08 || (time === 1 && late < 0.12), `${time} at ${now} ms`);
   }
 });
@@ -175,7 +175,7 @@ test('nothing is requested for a time whose pages are missing', () => {
   assert.ok(m.asked.every((t) => t < 0.5) && m.schedule.shown.time < 0.5 && m.schedule.shown.time > 0.45);
 });
 
-test('a page that comes or a camera that moves asks again, at rest nothing does', () => {
+test('a new page or a moved camera requests an order, at rest nothing does', () => {
   const m = new Machine();
   m.playing = false;
   m.frames(5);
@@ -184,7 +184,7 @@ test('a page that comes or a camera that moves asks again, at rest nothing does'
   m.frames(5);
   assert.equal(m.asked.length, 2);
   m.view = { ...VIEW, cameraFromWorld: Float64Array.from([0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0]) };
-  // Turned by a quarter: until its own order is there, the image keeps the camera that the order knows.
+  // Turned by a quarter: until its own order arrives, the image keeps the camera of the previous order.
   assert.equal(m.schedule.viewOf(m.view), VIEW);
   m.frames(5);
   assert.equal(m.asked.length, 3);

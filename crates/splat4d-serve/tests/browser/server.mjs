@@ -9,7 +9,7 @@ export const PLAYER = fileURLToPath(new URL('../../player/', import.meta.url));
 const TYPES = { '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.css': 'text/css' };
 
 /// Serves `files` (name → bytes or text) and the folders in `folders` (prefix → folder; the player is at /player/).
-/// `ranges: false`: a server that knows no ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
+/// `ranges: false`: a server without ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
 /// the connection. Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
 export async function serve({ files = {}, folders = {}, ranges = true, delay = 0, fail = () => false } = {}) {
   const state = { log: [], sent: 0, options: { ranges, delay, fail } };
@@ -17,7 +17,7 @@ export async function serve({ files = {}, folders = {}, ranges = true, delay = 0
   const server = http.createServer(async (request, response) => {
     const name = decodeURIComponent(new URL(request.url, 'http://x').pathname),
       { options } = state;
-    // What every browser asks for unasked.
+    // What every browser requests by itself.
     if (name === '/favicon.ico') return response.writeHead(204).end();
     if (options.delay) await new Promise((done) => setTimeout(done, options.delay));
     if (options.fail(request, state.log.length)) {

@@ -1,4 +1,4 @@
-// What the stream asks for and lets go of, with a recorded file and backend.
+// What the stream requests and lets go of, with a recorded file and backend.
 
 import assert from 'node:assert/strict';
 import test from 'node:test';
@@ -7,7 +7,8 @@ import { Stream } from '../../player/stream.js';
 import { sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
-/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages come when `arrive` says so.
+/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages arrive when `arrive` is
+/// called this way.
 /// `masks`: page k has key masks, of 5,000 bytes, in section 100 + k.
 function recorded(segments = 20, root = 2, masks = false) {
   const own = (id) => (masks ? { mask: 100 + id, maskBytes: 5000 } : {});
@@ -52,7 +53,7 @@ function recorded(segments = 20, root = 2, masks = false) {
   return { file, backend, there, asked, open, bad, tick, arrive, all };
 }
 
-test('a seek asks for its own moment first, by tier; what lies ahead comes after', async () => {
+test('a seek requests its own time first, by tier, then later ones', async () => {
   const r = recorded(),
     stream = new Stream(r.file, r.backend);
   stream.update(5.5);
@@ -72,7 +73,7 @@ test('a seek asks for its own moment first, by tier; what lies ahead comes after
   assert.ok(stream.ready(15.2) === 1);
 });
 
-test('playing looks ahead two seconds, in its direction and round the loop', async () => {
+test('playing prefetches two seconds, in its direction and around the loop', async () => {
   for (const [time, speed, ahead] of [
     [3.1, 1, [6, 7]],
     [18.5, 1, [21, 2]],
@@ -92,7 +93,7 @@ test('playing looks ahead two seconds, in its direction and round the loop', asy
   }
 });
 
-test('nothing is asked for twice, and an unchanged moment costs nothing', async () => {
+test('nothing is requested twice, and an unchanged time costs nothing', async () => {
   const r = recorded(),
     stream = new Stream(r.file, r.backend);
   for (let i = 0; i < 100; i++) stream.update(4.5 + i * 1e-4);
@@ -101,7 +102,7 @@ test('nothing is asked for twice, and an unchanged moment costs nothing', async 
   assert.equal(new Set(r.asked).size, r.asked.length);
 });
 
-test('above the budget the farthest goes, never this moment; too small a budget leaves lower tiers out', async () => {
+test('above the budget the farthest pages are dropped, never the current ones; too small a budget drops lower tiers', async () => {
   const r = recorded(),
     stream = new Stream(r.file, r.backend, { budget: 8 * 32_000 });
   for (let t = 0.5; t < 20; t++) {
@@ -131,7 +132,7 @@ test('above the budget the farthest goes, never this moment; too small a budget 
   assert.equal(none.there.size, 0);
 });
 
-test('a page that fails is tried again, then reported; the rest goes on', async () => {
+test('a failing page is retried, then reported; the others continue', async () => {
   const r = recorded(),
     errors = [],
     stream = new Stream(r.file, r.backend, { onerror: (e) => errors.push(e.message) });
@@ -146,7 +147,7 @@ test('a page that fails is tried again, then reported; the rest goes on', async 
   assert.equal(stream.ready(5.5), 2 / 3);
 });
 
-test('an image is whole when the coarsest tier of every span is there, or will not come', async () => {
+test('an image is complete when the coarsest tier of every span is loaded or failed', async () => {
   const r = recorded(),
     stream = new Stream(r.file, r.backend);
   stream.update(5.5);
@@ -181,7 +182,7 @@ test('an image is whole when the coarsest tier of every span is there, or will n
   assert.equal(tight.playable(5.5), true, 'nor one that the budget has no room for');
 });
 
-test('masks are asked for with their pages, which do not wait for them', async () => {
+test('masks are requested with their pages, which do not wait for them', async () => {
   const r = recorded(20, 2, true),
     stream = new Stream(r.file, r.backend);
   stream.update(5.5);
@@ -206,7 +207,7 @@ test('masks are asked for with their pages, which do not wait for them', async (
   assert.equal(new Set(r.asked).size, r.asked.length);
 });
 
-test('a mask that was stopped or failed is asked for again, its page is not', async () => {
+test('a stopped or failed mask is requested again, its page is not', async () => {
   const r = recorded(20, 2, true),
     errors = [],
     stream = new Stream(r.file, r.backend, { onerror: (e) => errors.push(e.message) });
@@ -242,7 +243,7 @@ test('a budget holds pages with their masks', async () => {
   }
 });
 
-test('a palette is there before its page, and asked for once', async () => {
+test('a palette is loaded before its page, and requested once', async () => {
   const { bytes } = sample({ scale: 5, codec: 0 }),
     server = await serve({ files: { a: bytes } });
   try {
@@ -263,7 +264,7 @@ test('a palette is there before its page, and asked for once', async () => {
   }
 });
 
-test('a first moment and a seek fetch their own bytes and no others', async () => {
+test('the first frame and a seek fetch only their own bytes', async () => {
   const { bytes } = sample({ scale: 8, codec: 0 });
   const server = await serve({ files: { a: bytes } });
   try {

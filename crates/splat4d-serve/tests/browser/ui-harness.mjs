@@ -36,7 +36,7 @@ export class Site {
     const path = new URL(request.url, this.url).pathname;
     if (path === '/config.json') return this.#send(response, JSON.stringify(this.config), 'json');
     if (this.pages[path]) return this.#send(response, this.pages[path], 'html');
-    // What every browser asks for unasked.
+    // What every browser requests by itself.
     if (path === '/favicon.ico') return response.writeHead(204).end();
     if (path === '/events') return this.#listen(response);
     if (path === '/photo') return this.#photo(new URL(request.url, this.url).searchParams, response);

@@ -9,7 +9,7 @@ import { launch } from './browser.mjs';
 import { Cost, Flight, Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
-/** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames a second. */
+/** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames per second. */
 const FIRST = 1, LAST = 5, FRAME = 1 / 25;
 const browser = await launch();
 const options = { skip: browser ? false : 'no browser', timeout: 60000 };
@@ -50,7 +50,7 @@ const settle = async page => {
   await page.waitForFunction(() => !document.querySelector('splat-4d').player.seeking);
 };
 
-test('the page names every module it will need, so that they come all at once', () => {
+test('the page preloads every module', () => {
   const text = name => readFileSync(new URL(`../../player/${name}`, import.meta.url), 'utf8');
   const met = new Set(['page.js']);
   for (const name of met) {
@@ -60,8 +60,8 @@ test('the page names every module it will need, so that they come all at once', 
   assert.deepEqual(named.sort(), [...met].sort());
 });
 
-test('the picture shrinks as far as it must and helps, and grows again', () => {
-  /** Plays `seconds` on a synthetic machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
+test('the resolution falls as far as needed and useful, and rises again', () => {
+  /** Plays `seconds` on a synthetic machine where a frame takes fixed + pixels·scale² ms, at most 60 frames per second. */
   const play = (pace, fixed, pixels, seconds = 20) => {
     const scales = [];
     for (let now = 0; now < 1000 * seconds;) {
@@ -84,7 +84,7 @@ test('the picture shrinks as far as it must and helps, and grows again', () => {
   assert.equal(Math.min(...play(new Pace(), 1, 5000, 60)), 0.25);
 });
 
-test('what a frame would cost at another resolution is known from two', () => {
+test('the cost of a frame at another resolution is predicted from two', () => {
   const cost = new Cost();
   assert.equal(cost.at(1), 0);
   // 80 ms for every frame and 240 for the pixels, as on a slow device; the first frame also waits for shaders.
@@ -103,7 +103,7 @@ test('what a frame would cost at another resolution is known from two', () => {
   assert.deepEqual([flight.count, flight.ms], [0, 80]);
 });
 
-test('keys play, seek, step, change speed, picture and camera', options, async () => {
+test('keys play, seek, step, change speed, channel and camera', options, async () => {
   const { page, ask, done } = await open();
   const state = () => ask(e => ({ t: e.currentTime, paused: e.paused, speed: e.player.speed, channel: e.player.channel,
     camera: e.camera, loop: e.player.loop, viewed: e.player.viewed, mode: e.player.controls.mode }));
@@ -192,7 +192,8 @@ test('the time slider scrubs by mouse and keys, and shows what is buffered', opt
   const rail = await ask(e => e.shadowRoot.querySelector('.rail').getBoundingClientRect().toJSON());
   await page.mouse.move(rail.left + rail.width / 2, rail.top + 1);
   await page.mouse.down();
-  // The slider is where the pointer is; the clock reads what is shown, which is the old image until pages of the new time came.
+  // The slider is where the pointer is; the clock reads what is shown, which is the old image until pages of the new
+  // time came.
   const read = () => ask(e => [e.player.target, e.currentTime, e.player.seeking, e.shadowRoot.querySelector('.time b').textContent]);
   const [target, shown, seeking, clock] = await read();
   near(target, 3, 0.02);
@@ -221,7 +222,7 @@ test('the time slider scrubs by mouse and keys, and shows what is buffered', opt
   await done();
 });
 
-test('a link brings back camera, time, picture and playing', options, async () => {
+test('a link restores camera, time, channel and playing', options, async () => {
   const first = await open();
   await first.page.mouse.move(500, 300);
   await first.page.mouse.down();
@@ -340,7 +341,7 @@ test('every control has a name, and the keyboard reaches it', options, async () 
   await done();
 });
 
-test('errors say what, where and what to do; the page recovers', options, async () => {
+test('errors state the cause, the place and the remedy; the page recovers', options, async () => {
   const { page, ask, done } = await open('', { config: { scene: 'broken.s4d' }, ready: false });
   const alert = page.getByRole('alert');
   await alert.waitFor();
@@ -361,7 +362,7 @@ test('errors say what, where and what to do; the page recovers', options, async 
   await empty.done();
 });
 
-test('a narrow window holds everything without scrolling sideways', options, async () => {
+test('a narrow window shows everything without horizontal scrolling', options, async () => {
   for (const size of [[390, 844], [360, 640], [640, 360], [320, 568]]) {
     const { page, ask, done } = await open('', { size, hasTouch: true });
     const check = async what => {
@@ -387,7 +388,7 @@ test('a narrow window holds everything without scrolling sideways', options, asy
   }
 });
 
-test('a phone upright sees the subject larger, with duration and speed; the hint comes once', options, async () => {
+test('an upright phone shows the subject larger, with duration and speed; the hint appears once', options, async () => {
   const { page, ask, done } = await open('', { size: [390, 844], hasTouch: true, isMobile: true });
   const seen = await ask(e => {
     const p = e.player, shown = name => e.shadowRoot.querySelector(name).checkVisibility();
@@ -414,7 +415,7 @@ test('a phone upright sees the subject larger, with duration and speed; the hint
   await done();
 });
 
-test('a page without the leave to edit fetches no editor', options, async () => {
+test('a page without permission to edit loads no editor', options, async () => {
   const asked = [];
   const { page, done } = await open('', {});
   page.on('request', r => asked.push(r.url()));
@@ -425,7 +426,7 @@ test('a page without the leave to edit fetches no editor', options, async () => 
   await done();
 });
 
-test('controls rest while it plays and come back; reduced motion does not play by itself', options, async () => {
+test('controls hide during playback and reappear; reduced motion does not autoplay', options, async () => {
   const moving = await open('', { config: { scene: 'scene.s4d', title: 'x' } });
   assert.equal(await moving.ask(e => e.paused), false, 'a page plays by itself');
   await moving.page.mouse.move(500, 200);
@@ -441,7 +442,7 @@ test('controls rest while it plays and come back; reduced motion does not play b
   await calm.done();
 });
 
-test('a path is made, played, exported and read again; bullet time holds the clock', options, async () => {
+test('a path is made, played, exported and read again; bullet time stops the clock', options, async () => {
   const { page, ask, done } = await open();
   const at = (camera, t) => ask((e, [camera, t]) => { e.camera = camera; e.seek(t); }, [camera, t]);
   await at({ position: [0, 1, 5], target: [0, 1, 0], fov: 40 }, 1);
@@ -485,7 +486,7 @@ test('a path is made, played, exported and read again; bullet time holds the clo
   }
   await page.keyboard.press('Escape');
   await page.keyboard.press('p');
-  // Both are read in one breath: the path lasts half a second, and may be over before a second question.
+  // Both are read in one breath: the path lasts half a second, and may be over before a second query.
   const moment = await page.waitForFunction(() => {
     const e = document.querySelector('splat-4d');
     return e.currentTime > 1.2 && e.currentTime < 1.5 && [e.currentTime, e.camera.position[0]];
@@ -552,7 +553,7 @@ test('training is followed: late join, new snapshots, lost connections', options
   await card.getByText('Training finished').waitFor();
   await card.getByRole('button', { name: 'Save the scene' }).waitFor();
   assert.equal(await ask(e => e.player.file.name), 'bytes', 'the page has the scene itself');
-  // The server may end now: the page asks for nothing more.
+  // The server may end now: the page requests nothing more.
   const [last, answered] = [site.joined, []];
   page.on('request', r => answered.push(r.url()));
   site.cut();
@@ -563,7 +564,7 @@ test('training is followed: late join, new snapshots, lost connections', options
   await done();
 });
 
-test('what is remembered, and the choice of a backend', options, async () => {
+test('stored preferences, and the choice of a backend', options, async () => {
   const { page, ask, context, done } = await open('', { colorScheme: 'dark' });
   const page_ = () => ask(e => getComputedStyle(e.shadowRoot.querySelector('.root')).getPropertyValue('--page').trim());
   assert.equal(await page_(), '#0d0f12');
@@ -577,7 +578,7 @@ test('what is remembered, and the choice of a backend', options, async () => {
   await done();
 });
 
-test('an eye of a headset sees what the page sees, from its own place', options, async () => {
+test('an eye of a headset renders the scene of the page from its own pose', options, async () => {
   const { ask, done } = await open();
   const [page, eye, right] = await ask(async e => {
     const { eyeView } = await import('/player/xr.js');

@@ -100,14 +100,14 @@ async function compare(setup, what) {
 
 const SHOWN = { color: [0.3, 0.7, 1], alpha: [0.3], depth: [0.7], flow: [0.3] };
 for (const [channel, time] of Object.entries(SHOWN).flatMap(([c, times]) => times.map((t) => [c, t]))) {
-  test(`${channel} at ${time} s is the reference's`, options, async (t) => {
+  test(`${channel} at ${time} s equals the reference's`, options, async (t) => {
     const db = await compare(SCENE, { ...LOOK, channel, time });
     t.diagnostic(`${db.toFixed(1)} dB`);
     assert.ok(db >= LEAST_DB, `${db} dB`);
   });
 }
 
-test('a camera amidst the Gaussians sees all there is: no block is culled too early', options, async (t) => {
+test('from a camera among the Gaussians no block is culled too early', options, async (t) => {
   const setup = { pages: [[0, 5000, { from: 0, to: 1, logScale: [-5, -1.7], size: 2, edges: true, seed: 9 }]] };
   for (const eye of [[0.4, 0.1, 0.3], [-1.2, 0.3, -0.2], [2, -2, 0.1]]) {
     const db = await compare(setup, { ...LOOK, view: [eye, 120, 90, 60], time: 0.4 });
@@ -116,14 +116,14 @@ test('a camera amidst the Gaussians sees all there is: no block is culled too ea
   }
 });
 
-test('a clock that begins late is as exact', options, async (t) => {
+test('a clock that begins late is as accurate', options, async (t) => {
   const setup = { clip: [5000, 5001], pages: [[0, 1500, { from: 5000, to: 5001.04 }]] };
   const db = await compare(setup, { ...LOOK, time: 5000.3 });
   t.diagnostic(`${db.toFixed(1)} dB`);
   assert.ok(db >= LEAST_DB, `${db} dB`);
 });
 
-test('resident.wgsl unpacks random words and every edge code as the format says', options, async (t) => {
+test('resident.wgsl unpacks random words and every edge code as specified', options, async (t) => {
   const [span, times] = [0.8, [-0.05, 0.31, 0.79]];
   const { page, entry } = toy.page(3, 4096, { from: 0, to: span, edges: true, opacity: [0, 255], forever: 0.1 });
   const got = await tab.evaluate(async ([span, times]) => {
@@ -218,7 +218,7 @@ test('the order on the GPU is that of depth, then number, and repeats', options,
   t.diagnostic(`${first.order.length} records`);
 });
 
-test('pages come and go, palettes come late, and nothing is drawn twice', options, async () => {
+test('pages are added and dropped, palettes arrive late, and nothing is rendered twice', options, async () => {
   const result = await tab.evaluate(async ([s, w]) => {
     await scene(s, w.view[1], w.view[2]);
     const whole = await picture(w);
@@ -236,7 +236,7 @@ test('pages come and go, palettes come late, and nothing is drawn twice', option
     for (const p of s.palettes) backend.addPalette(toy.palette(...p));
     const late = await picture(w);
     const resident = backend.stats.resident;
-    // Switching channels there and back, resizing there and back, and drawing again change nothing.
+    // Switching channels and back, resizing and back, and rendering again change nothing.
     await picture({ ...w, channel: 'depth' });
     const back = await picture(w);
     backend.resize(60, 50);
@@ -250,7 +250,7 @@ test('pages come and go, palettes come late, and nothing is drawn twice', option
     resident: 2500 });
 });
 
-test('more than a first page of room: buffers grow and keep what was there', options, async () => {
+test('buffers grow beyond the first page and keep their content', options, async () => {
   const same = await tab.evaluate(async ([s, w]) => {
     await scene(s, w.view[1], w.view[2]);
     const before = await picture(w);
@@ -263,7 +263,7 @@ test('more than a first page of room: buffers grow and keep what was there', opt
   assert.equal(same, true);
 });
 
-test('30,000 Gaussians at 800x800: time a stage', options, async (t) => {
+test('30,000 Gaussians at 800x800: time per stage', options, async (t) => {
   const setup = { palettes: [[7, 3, 256]], pages: [[0, 30000, { from: 0, to: 1, palette: 7, entries: 256,
     logScale: [-6, -3.6] }]] };
   const what = { ...LOOK, view: [VIEW[0], 800, 800, 760] };
@@ -283,12 +283,12 @@ test('30,000 Gaussians at 800x800: time a stage', options, async (t) => {
   assert.ok(stats.drawn > 5000 && stats.drawn <= 30000 && stats.active === 30000 && stats.resident === 30000);
 });
 
-test('nothing complained', options, async () => {
+test('no warnings or errors were logged', options, async () => {
   assert.deepEqual(complaints, []);
   assert.deepEqual(await tab.evaluate(() => lost), []);
 });
 
-test('a lost device is told once, and drawing on harms nothing', options, async () => {
+test('a lost device is reported once, and further draws are harmless', options, async () => {
   // Chromium's own way to end the process that holds the device.
   const session = await browser.newBrowserCDPSession();
   await session.send('Browser.crashGpuProcess').catch(() => {});

@@ -96,7 +96,7 @@ test('a simulated headset sees the scene with both eyes', options, async (t) => 
   assert.deepEqual(errors, []);
 });
 
-test('in a simulated room the scene stands on the floor, and a tap puts it elsewhere', options, async (t) => {
+test('in a simulated room the scene is on the floor, and a tap moves it', options, async (t) => {
   const { page, errors } = await prepared(t);
   const seen = await page.evaluate(async () => {
     const { player, shadowRoot } = document.querySelector('splat-4d');

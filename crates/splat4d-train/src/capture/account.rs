@@ -1,4 +1,4 @@
-//! What a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
+//! Content that a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
 
 /// How bad a [`Finding`](super::Finding) is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -9,14 +9,14 @@ pub enum Severity {
     Warning,
 }
 
-/// What a `Remark` is about.
+/// Kind of a `Remark`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Aspect {
     /// Files or lines that the capture names and that are not there.
     NotFound,
     /// Files, keys or lines that are there and not used.
     NotRead,
-    /// What the capture does not state, and what was taken for it.
+    /// Assumptions about what the capture does not state.
     Assumed,
     /// A check that could not run, and why.
     NotChecked,
@@ -40,7 +40,7 @@ impl Aspect {
 /// One sentence or two, with numbers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Remark {
-    /// What it is about.
+    /// Its subject.
     pub aspect: Aspect,
     /// How bad it is.
     pub severity: Severity,

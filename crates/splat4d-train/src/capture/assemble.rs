@@ -1,4 +1,4 @@
-//! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
+//! From what the files specify to a checked capture: poses, sizes, files, duplicates, split, clock.
 
 use super::account::Severity;
 use super::account::{Aspect, Remark, first_names};
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 /// Every how many images one is held out where no rig and no convention states otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
-/// White: what transparent pixels are composited on by default (the papers' choice for D-NeRF).
+/// White: the default background of transparent pixels (the papers' choice for D-NeRF).
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Checks what a reader found and makes a capture of it.
@@ -131,18 +131,19 @@ fn unread_clouds(take: &mut RawCapture) {
     }
 }
 
-/// Points nearer than this share of all that a training camera sees may be wrong ones.
+/// Points nearer than this share of all points of a training camera may be outliers.
 const STRAY_POINTS: f64 = 0.01;
-/// Of the distance of the nearest points: Gaussians in front of them are still drawn.
+/// Of the distance of the nearest points: Gaussians in front of them are still rendered.
 const BEFORE_POINTS: f64 = 0.5;
 
 /// Some distance there must be, of the extent: the projection divides by it.
 const SMALLEST_NEAR: f64 = 1e-3;
 
-/// Of the wanted share, where no points say how near things come.
+/// Of the requested share, where no points give the nearest distance.
 const UNKNOWN_DEPTH: f64 = 0.25;
 
-/// How near splats are drawn, scene units: this share of the extent, or half way to the nearest of the capture's points.
+/// How near splats are rendered, scene units: this share of the extent, or half way to the nearest of the capture's
+/// points.
 pub(super) fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
     let mut depths: Vec<f64> = Vec::new();
@@ -182,7 +183,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
     }
 }
 
-/// The flows of all frames, each with the frame of its camera that comes next.
+/// The flows of all frames, each with the next frame of its camera.
 fn flows(frames: &mut [RawFrame]) -> Vec<Option<FlowFile>> {
     let numbers: BTreeMap<(usize, usize), usize> =
         frames.iter().enumerate().map(|(i, f)| ((f.camera, f.index), i)).collect();
@@ -222,8 +223,8 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     Ok(())
 }
 
-/// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before missing images
-/// were skipped, which was said.
+/// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before
+/// missing images were skipped, which was reported.
 fn drop_unused_cameras(take: &mut RawCapture, listed: &BTreeSet<usize>) {
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     let unused: Vec<&str> =
@@ -247,7 +248,7 @@ fn rigs(take: &RawCapture) -> Vec<Rig> {
     take.cameras.iter().zip(fixed).map(|(name, fixed)| Rig { name: name.clone(), fixed }).collect()
 }
 
-/// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,
+/// Two fixed cameras with one pose are a mistake, such as a copied matrix. Photos may be taken twice from one place,
 /// but what is measured then was learnt.
 fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut first: BTreeMap<usize, &RawFrame> = BTreeMap::new();
@@ -281,7 +282,7 @@ fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     Ok(())
 }
 
-/// What training and measuring share is reported, not refused: published data sets do it.
+/// Images used for both training and evaluation are reported, not refused: published data sets do it.
 fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     if shared > 0 {
         warnings.push(format!(
@@ -290,8 +291,8 @@ fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     }
 }
 
-/// One camera takes one image at a time. Where the data set names none, one "camera" may stand for several, so that
-/// the pose counts too.
+/// One camera takes one image at a time. Where the data set names none, one "camera" may represent several, so that the
+/// pose counts too.
 fn check_duplicates(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
     let mut shared = 0;
@@ -359,7 +360,7 @@ fn skip_missing(take: &mut RawCapture, options: &CaptureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Takes out frames that are listed twice: with one image, pose, time and purpose.
+/// Removes frames that are listed twice: with one image, pose, time and purpose.
 fn skip_repeated(take: &mut RawCapture) {
     let mut earlier: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
     let mut repeated = BTreeSet::new();
@@ -390,7 +391,7 @@ fn skip_repeated(take: &mut RawCapture) {
     take.frames.retain(|_| kept.next().unwrap_or(true));
 }
 
-/// Says which frames have one image and different poses: one of them shows something else.
+/// Reports frames with one image and different poses, of which one must be wrong.
 fn shared_images(take: &mut RawCapture) {
     let mut first: BTreeMap<&Path, usize> = BTreeMap::new();
     let mut twice = Vec::new();
@@ -424,17 +425,16 @@ fn fits(size: (usize, usize), camera: &Camera) -> bool {
     size == (camera.width, camera.height) || picture::is_resized(size, camera)
 }
 
-/// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns
-/// whether any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which
-/// sizes do
-/// not say so.
+/// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns whether
+/// any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which sizes do not
+/// specify it.
 fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
     let mut resized = Vec::new();
     let mut upright = Vec::with_capacity(take.frames.len());
-    // Turned images whose sizes say which pixels are described, and those whose sizes do not.
+    // Turned images whose sizes specify which pixels are described, and those whose sizes do not.
     let (mut by_size, mut unsure) = ([0; 2], Vec::new());
-    // COLMAP reads pixels as they are stored, and so do the scripts that write these layouts.
+    // COLMAP reads pixels as stored, and so do the scripts that write these layouts.
     let of_colmap = matches!(take.kind, CaptureKind::Colmap | CaptureKind::N3dv | CaptureKind::Llff);
     let mut as_stored = 0;
     for frame in &mut take.frames {
@@ -497,7 +497,7 @@ fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool
     Ok((alpha, upright, unsure))
 }
 
-/// Says what was done with EXIF orientations of COLMAP's images, and of those whose sizes decide.
+/// Reports how EXIF orientations were applied to COLMAP's images, and to those whose sizes decide.
 fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 2]) {
     let all = take.frames.len();
     let mut say = |n: usize, what: &str| {
@@ -514,7 +514,7 @@ fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 
     say(by_size[1], "It is applied: only the upright images have the size of their intrinsics.");
 }
 
-/// Decides by points and features whether EXIF orientations are applied where sizes do not say so, and states it.
+/// Decides by points and features whether EXIF orientations are applied where sizes do not specify it, and states it.
 fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
     if unsure.is_empty() {
         return;
@@ -549,7 +549,7 @@ fn check_masks(take: &RawCapture, has_alpha: bool) -> Result<()> {
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
             Ok(true) => return Ok(()),
             Ok(false) => {}
-            // A broken image has its own error, with more to say, when it is loaded.
+            // A broken image has its own, more detailed error when it is loaded.
             Err(_) if frame.mask.is_none() => return Ok(()),
             Err(e) => return Err(e),
         }
@@ -571,7 +571,7 @@ fn check_mask_shapes(take: &RawCapture) -> Result<()> {
         let header = picture::header(mask)?;
         if ![header.stored, header.upright()].iter().any(|&size| fits(size, &own)) {
             picture::check_not_larger("mask", header.upright(), &own).map_err(|e| e.at(mask.display()))?;
-            picture::check_beside(mask, "mask", header.stored, &own)?;
+            picture::check_companion(mask, "mask", header.stored, &own)?;
         }
     }
     Ok(())
@@ -635,6 +635,6 @@ fn estimate_up(frames: &[RawFrame]) -> [f64; 3] {
     for frame in frames {
         (0..3).for_each(|k| sum[k] -= frame.source.cam_from_world.rotation[1][k]);
     }
-    // Cameras all round a scene that look straight down cancel out; then any axis is as good.
+    // Cameras all round a scene that point straight down cancel out; then any axis will do.
     if norm(sum) > 1e-3 * frames.len() as f64 { normalize(sum) } else { [0.0, 0.0, 1.0] }
 }

@@ -1,14 +1,14 @@
-//! Black borders: pixels that no lens recorded. Undistorting an image leaves them along its edges, letterboxing above and
-//! below, a fisheye lens around its circle. A scene that was trained on them has black Gaussians in front of its cameras,
-//! and no scene can be scored there.
+//! Black borders: pixels that no lens recorded. Undistorting an image leaves them along its edges, letterboxing above
+//! and below, a fisheye lens around its circle. A scene that was trained on them has black Gaussians in front of its
+//! cameras, and no scene can be scored there.
 //!
-//! A pixel belongs to a border if it is black in all sampled images of one lens and connected to the image's edge by such
-//! pixels. That alone would also find the black background of a photographed object. The content next to a border is what
-//! is anywhere in the scene, next to the object's outline it is the background again: so a border counts only if the
-//! images are mostly bright a few pixels further inside.
+//! A pixel belongs to a border if it is black in all sampled images of one lens and connected to the image's edge by
+//! such pixels. That alone would also find the black background of a photographed object. The content next to a border
+//! is what is anywhere in the scene, next to the object's outline it is the background again: so a border counts only
+//! if the images are mostly bright a few pixels further inside.
 //!
-//! What is examined is the same for every part of a capture: the first image of each fixed camera, and images of moving ones
-//! evenly. The parts of one run get what the first of them found ([`Lenses`]).
+//! The same images are examined for every part of a capture: the first image of each fixed camera, and images of moving
+//! ones evenly. The parts of one run get what the first of them found ([`Lenses`]).
 
 use super::account::Severity;
 use super::account::{Aspect, Remark};
@@ -28,28 +28,27 @@ const PIXELS: usize = 30_000_000;
 const FEWEST: usize = 6;
 /// Lenses that are examined, those with the most images first: it bounds the time.
 const LENSES: usize = 8;
-/// What counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
+/// Largest value that counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
 const BLACK: u8 = 40;
 /// Pixels beyond a border that interpolation and JPEG have mixed with it.
 const MIXED: usize = 2;
 /// How far behind a border the content is examined, pixels.
 const INSIDE: usize = MIXED + 2;
-/// Share of the content behind a border that is not black. Chosen between the two kinds: content is bright in most places,
-/// and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are
-/// distinguished
-/// (studies/records/2026-11-26-real-size.md).
+/// Share of the content behind a border that is not black. Chosen between the two kinds: content is bright in most
+/// places, and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are
+/// distinguished (studies/records/2026-11-26-real-size.md).
 const BRIGHT: f64 = 0.5;
 /// Share of each of two opposite edges that is black: an undistorted or letterboxed image has both.
 const OF_AN_EDGE: f64 = 0.5;
-/// Largest share of an image that borders cover: a circle of full height leaves 41 % of a 4:3 image and 56 % of a 16:9 image
-/// black.
+/// Largest share of an image that borders cover: a circle of full height leaves 41 % of a 4:3 image and 56 % of a 16:9
+/// image black.
 const LARGEST: f64 = 0.6;
 
 /// Images that are decoded at a time after the first: most lenses have no border, and one image states so.
 const AT_ONCE: usize = 4;
 
-/// Finds the borders of a capture's images and gives them to its frames; states so in the account. `firsts`: the first image of
-/// cameras of which only a part of the frames is listed.
+/// Finds the borders of a capture's images and gives them to its frames; states so in the account. `firsts`: the first
+/// image of cameras of which only a part of the frames is listed.
 pub(super) fn find(capture: &mut Capture, options: &CaptureOptions, firsts: &BTreeMap<usize, PathBuf>) {
     if options.borders == Borders::Keep {
         return;
@@ -142,7 +141,7 @@ fn recorded(views: &[Frame]) -> Option<Vec<u8>> {
     border(&bright, width, height)
 }
 
-/// Where an image is not black; `None`: it cannot be read or is transparent in places, so that its colours there mean
+/// Non-black pixels of an image; `None`: it cannot be read or is transparent in places, so that its colours there mean
 /// nothing.
 fn not_black(frame: &Frame) -> Option<Vec<bool>> {
     let raster = picture::decode_as(&frame.image, Some(&panorama::stored(&frame.source)), frame.upright).ok()?;
@@ -155,7 +154,7 @@ fn not_black(frame: &Frame) -> Option<Vec<bool>> {
     Some((0..pixels).map(|p| (0..colours).any(|c| raster.get(p, c) > least)).collect())
 }
 
-/// What is recorded, 1 or 0, of images of one size that are `bright` in places; `None`: no border is found.
+/// Recorded pixels, 1 or 0, of images of one size that are `bright` in places; `None`: no border is found.
 fn border(bright: &[Vec<bool>], width: usize, height: usize) -> Option<Vec<u8>> {
     let mut black = vec![true; width * height];
     for image in bright {
@@ -208,7 +207,7 @@ fn from_edges(set: &[bool], width: usize, height: usize) -> Vec<bool> {
     out
 }
 
-/// The set with all pixels at most so far from it, along rows and columns.
+/// The set dilated by this distance, along rows and columns.
 fn grown(set: &[bool], width: usize, height: usize, by: usize) -> Vec<bool> {
     let near = |i: usize, end: usize| i.saturating_sub(by)..(i + by + 1).min(end);
     let rows: Vec<bool> = (0..width * height).map(|p| near(p % width, width).any(|x| set[p - p % width + x])).collect();

@@ -1,7 +1,7 @@
 //! COLMAP reconstructions: `sparse/0/{cameras,images,points3D}.{bin,txt}` and the images in `images/`.
 //!
-//! COLMAP knows no time. Image names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
-//! only one registered image, the other images of that camera on disk share its pose: the usual way to calibrate a
+//! COLMAP models have no times. Image names `cam/frame` or `cam_frameN` give camera and frame number; where each camera
+//! has only one registered image, the other images of that camera on disk share its pose: the usual way to calibrate a
 //! fixed rig is to reconstruct one time.
 
 mod multiview;
@@ -28,14 +28,14 @@ pub(super) const SPARSE: &str = "sparse";
 pub(super) const NESTED: &str = "colmap/sparse";
 /// The model of 4DGaussians' "multipleview" layout.
 pub(super) const MULTIVIEW: &str = "sparse_";
-/// Where the files of a model lie if there is no folder for several.
+/// Folder of a model's files if there is no folder for several.
 pub(super) const COLMAP: &str = "colmap";
-/// Models of workspaces next to the images, or with images of their own: those of `image_undistorter`, and last the model
-/// from which the converter of 3DGS undistorts.
+/// Models of workspaces next to the images, or with images of their own: those of `image_undistorter`, and last the
+/// model from which the converter of 3DGS undistorts.
 pub(super) const WORKSPACES: [&str; 4] = ["undistorted/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse"];
 /// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
 const POINTS: &str = "points3D.ply";
-/// Where a model may be next to poses of another layout: COLMAP's habit and Nerfstudio's.
+/// Folders of a model next to poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
 /// Names of folders between a capture's folder and a model's files, in addition to numbers.
 const MODEL_FOLDERS: [&str; 6] = [SPARSE, MULTIVIEW, COLMAP, "distorted", "undistorted", "dense"];
@@ -105,8 +105,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     })
 }
 
-/// The capture's folder of a model: the nearest one with images, of itself and those above while they are named as folders
-/// of models are.
+/// The capture's folder of a model: the nearest one with images, of itself and those above while they are named as
+/// folders of models are.
 fn capture_folder(models: &Path) -> PathBuf {
     let mut folder = models.to_path_buf();
     loop {
@@ -256,7 +256,7 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
 
 /// The points of a COLMAP model that is next to `marker`, whose frames are `frames`: in their world, if the cameras
 /// agree. The result is reported.
-pub(super) fn points_beside(
+pub(super) fn companion_points(
     root: &Path,
     marker: &Path,
     frames: &[RawFrame],

@@ -308,7 +308,8 @@ fn images_txt(text: &str) -> Result<Vec<Registered>> {
         let name = Some(name).filter(|n| !n.is_empty());
         let name = name.ok_or_else(|| Error::input(format!("line {line} ends before the image's name")))?;
         images.push(Registered { quat, translation, camera, name: name.to_string() });
-        // The image's 2D points follow on a line of their own, which may be empty. Scripts that have poses only leave it out.
+        // The image's 2D points follow on a line of their own, which may be empty. Scripts that have poses only leave
+        // it out.
         lines.next_if(|(_, next)| !is_image_line(next));
     }
     Ok(images)
@@ -325,8 +326,8 @@ fn image_words(text: &str) -> (Vec<&str>, &str) {
     (words, rest)
 }
 
-/// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, and no number; or its words
-/// are not triples.
+/// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, not a number; or its
+/// words are not triples.
 fn is_image_line(text: &str) -> bool {
     let words: Vec<&str> = text.split_ascii_whitespace().collect();
     let numbers = words.iter().take(9).filter(|w| w.parse::<f64>().is_ok()).count();

@@ -1,4 +1,4 @@
-//! What the numbers of a pose mean: direction, camera axes, order of rows and of quaternions; and poses that are written in
+//! Conventions of poses: direction, camera axes, order of rows and of quaternions; and poses that are written in
 //! another convention than their layout states (`capture.poses`).
 
 use crate::settings::Value;
@@ -23,13 +23,13 @@ impl Convention {
     pub(crate) const COLMAP: Self = Self { world_to_camera: true, opengl: false, quaternions: true };
     /// World to camera, OpenCV axes, matrices.
     pub const OPENCV: Self = Self { quaternions: false, ..Self::COLMAP };
-    /// Nerfies: the rotation of world to camera and the camera's position, OpenCV axes: what is mistaken there is the rotation's
-    /// direction, as with camera to world.
+    /// Nerfies: the rotation of world to camera and the camera's position, OpenCV axes: what is mistaken there is the
+    /// rotation's direction, as with camera to world.
     pub(crate) const NERFIES: Self = Self { world_to_camera: false, opengl: false, quaternions: false };
     /// NeRF's files: camera to world, OpenGL axes.
     pub(crate) const NERF: Self = Self { world_to_camera: false, opengl: true, quaternions: false };
 
-    /// `cam_from_world` in OpenCV axes of a pose as it is written.
+    /// `cam_from_world` in OpenCV axes of a pose as written.
     fn read(self, mut pose: Se3) -> Se3 {
         if self.world_to_camera {
             if self.opengl {
@@ -54,7 +54,7 @@ impl Convention {
         pose
     }
 
-    /// `cam_from_world` in OpenCV axes of a pose that is written as `poses` say.
+    /// `cam_from_world` in OpenCV axes of a pose that is written as `poses` specify.
     pub(super) fn read_as(self, mut pose: Se3, poses: Poses) -> Result<Se3> {
         if poses.xyzw {
             if !self.quaternions {
@@ -74,13 +74,13 @@ impl Convention {
         Ok(Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.read(pose))
     }
 
-    /// What a pose that was read as this convention would be, had it been written as `poses` say.
+    /// A pose that was read as this convention, reinterpreted as written in `poses`.
     /// Errors: quaternions in a layout that has none.
     pub(crate) fn reread(self, cam_from_world: &Se3, poses: Poses) -> Result<Se3> {
         self.read_as(self.write(cam_from_world), poses)
     }
 
-    /// What is read of a pose that is written as `poses` say, while this convention is stated.
+    /// The pose read under this convention from one written as `poses` specify.
     #[cfg(test)]
     pub(crate) fn misread(self, truth: &Se3, poses: Poses) -> Se3 {
         let mut raw = Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.write(truth);
@@ -130,7 +130,7 @@ fn flip_columns(pose: &mut Se3) {
     }
 }
 
-/// What the poses of a file are written as, where it is not what the layout states.
+/// Convention of a file's poses, if it is not that of the layout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Poses {
     /// Whether the camera's axes are OpenGL's; `None`: as stated.
@@ -148,7 +148,7 @@ impl Poses {
     pub const STATED: Self = Self { opengl: None, inverse: false, transposed: false, xyzw: false };
     const WORDS: [&str; 5] = ["opencv", "opengl", "inverse", "transposed", "xyzw"];
 
-    /// What the poses turn out to be, in words; relative to what `stated` states.
+    /// The convention found for the poses, as text; relative to what `stated` states.
     pub(crate) fn in_words(self, stated: Convention) -> String {
         let mut parts: Vec<&str> = Vec::new();
         match self.opengl {
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_comes_back_from_every_convention() {
+    fn poses_round_trip_in_every_convention() {
         let truth = Se3::look_at([3.0, -2.0, 1.5], [0.2, 0.1, 0.0], [0.0, 0.0, 1.0]);
         for stated in [Convention::COLMAP, Convention::OPENCV, Convention::NERF] {
             assert!(apart(&stated.misread(&truth, Poses::STATED), &truth) < 1e-12);

@@ -1,5 +1,5 @@
-//! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a scale
-//! and a shift only, as networks predict it from a single image.
+//! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a
+//! scale and a shift only, as networks predict it from a single image.
 //!
 //! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
 
@@ -19,7 +19,7 @@ const NOWHERE: f32 = 1e9;
 /// mean over an edge is the depth of neither side (docs of scene flow: bilinear samples within 5 %).
 const ONE_SURFACE: f32 = 0.05;
 
-/// What the numbers of a depth map are.
+/// Kinds of depth maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthKind {
     /// z along the camera's axis, scene units.
@@ -97,7 +97,7 @@ pub(super) fn reduce(map: &[f32], width: usize, height: usize, k: usize) -> Vec<
     out
 }
 
-/// A map as its file has it, in scene units where it is metric.
+/// A map as stored, in scene units where it is metric.
 struct Map {
     width: usize,
     height: usize,

@@ -1,4 +1,5 @@
-//! What a capture reads from outside of its folder: it names files by other paths, or holds links to folders or to files.
+//! Files that a capture reads from outside its folder: it names files by other paths, or holds links to folders or to
+//! files.
 
 use super::Frame;
 use std::collections::BTreeSet;

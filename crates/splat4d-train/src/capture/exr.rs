@@ -13,7 +13,7 @@ const MOST_LINES: usize = 256;
 /// Most bytes of a block of all channels, which is decompressed as a whole.
 const MOST_BLOCK: usize = 256 << 20;
 
-/// Width, height and numbers. `check` sees the size before anything of that size is allocated.
+/// Width, height and numbers. `check` gets the size before anything of that size is allocated.
 ///
 /// Errors: damage, no channel that is known for depth, those of `check`.
 pub(super) fn read(bytes: &[u8], check: impl Fn((usize, usize)) -> Result<()>) -> Result<(usize, usize, Vec<f32>)> {

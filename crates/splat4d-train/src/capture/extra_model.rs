@@ -17,15 +17,15 @@ const ANGLE: f64 = 0.02;
 /// Spread of cameras in one place, of their distance from the origin: rounding.
 const ONE_PLACE: f64 = 1e-9;
 
-/// What an image's path is called in both descriptions: without its ending and without folders that name no camera.
+/// Common form of an image's path in both descriptions: without its ending and without folders that name no camera.
 pub(super) fn key(path: &Path) -> String {
     let plain = path.with_extension("");
     let parts = plain.iter().filter_map(|part| part.to_str()).filter(|part| !rig::is_plain(part));
     parts.collect::<Vec<_>>().join("/")
 }
 
-/// The similarity from the second world into the first, the identity where they agree as they are; `pairs` are one
-/// camera's poses in both. Errors: they do not agree, and by how much.
+/// The similarity from the second world into the first, the identity where they already agree; `pairs` are one camera's
+/// poses in both. Errors: they do not agree, and by how much.
 pub(super) fn align(pairs: &[(Se3, Se3)]) -> Result<Sim3> {
     const REMEDY: &str = "Points of the poses' own world can be named by ply_file_path, or by --set init=FILE.";
     if pairs.len() < LEAST {
@@ -80,7 +80,7 @@ fn spread(pairs: &[(Se3, Se3)]) -> f64 {
 }
 
 /// The rotation that all cameras' axes agree on, then scale and translation of their places: axes are more reliable
-/// than positions where cameras stand in a row.
+/// than positions where cameras are in a row.
 fn fit(pairs: &[(Se3, Se3)]) -> Sim3 {
     let mut cov = [[0.0; 3]; 3];
     for (a, b) in pairs {

@@ -2,8 +2,8 @@
 //! 64 v + 32768, u right and v down in pixels, and blue is not zero where they are known; `.flo` (Baker et al. 2007,
 //! Middlebury) and `.npy`, as networks write them.
 //!
-//! A frame's file states where each of its pixels goes by the next frame of its camera. In memory all keep KITTI's code, for
-//! the pinhole view.
+//! A frame's file contains the displacement of its pixels to the next frame of its camera. In memory all keep KITTI's
+//! code, for the pinhole view.
 
 use super::json;
 use super::lens::Distortion;
@@ -32,7 +32,7 @@ pub struct FlowFile {
     pub path: PathBuf,
     /// The number, in `Capture::frames`, of the frame at which the pixels arrive: the next one of the same camera.
     pub to: usize,
-    /// Whether it is flow of the view, from this program, and not of the image as it is stored.
+    /// Whether it is flow of the view, from this program, and not of the stored image.
     pub of_view: bool,
 }
 
@@ -119,7 +119,7 @@ fn decode_flo(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
         return Err(bad("not a .flo file: it does not start with 202021.25".into()));
     }
     let [width, height] = [width, height].map(|side| i32::from_le_bytes(side).max(0) as usize);
-    picture::check_beside(path, "flow", (width, height), camera)?;
+    picture::check_companion(path, "flow", (width, height), camera)?;
     let body = &bytes[12..];
     if body.len() < 8 * width * height {
         return Err(bad(format!("the .flo file is cut short: {} bytes for {width}x{height} vectors", body.len())));
@@ -145,7 +145,7 @@ fn decode_npy(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
             .remedy("Save u (right) and v (down) in pixels: numpy.save(path, flow.astype('f4'))"));
         }
     };
-    picture::check_beside(path, "flow", (width, height), camera)?;
+    picture::check_companion(path, "flow", (width, height), camera)?;
     let (values, n) = (array.to_f32(), width * height);
     let at = |p: usize, c: usize| if first { values[c * n + p] } else { values[p * channels + c] };
     encode(path, width, (0..n).map(|p| [at(p, 0), at(p, 1), if channels == 3 { at(p, 2) } else { 1.0 }]))
@@ -163,7 +163,7 @@ pub(crate) fn to_picture(flow: &Planes<f32>) -> image::ImageBuffer<image::Rgb<u1
 }
 
 fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
-    let raster = picture::decode_beside(path, "flow", camera)?;
+    let raster = picture::decode_companion(path, "flow", camera)?;
     let bad = |what: &str| {
         Err(Error::input(format!("the flow image has {what}"))
             .at(path.display())

@@ -1,5 +1,5 @@
-//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states where
-//! poses and images are; what is common to them is here. They were built from public documentation and synthetic samples.
+//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states
+//! where poses and images are; shared code is here. They were built from public documentation and synthetic samples.
 
 mod metashape;
 mod polycam;
@@ -30,7 +30,7 @@ struct Export {
     read: fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>,
 }
 
-/// In the order in which they are searched for: those that are recognized by their content come last.
+/// In the order in which they are searched for: those that are recognised by their content are last.
 const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
 
 /// Reads the export in a folder, or that a file is. `None`: it is none.
@@ -58,10 +58,10 @@ struct Shot {
     depth: Option<DepthFile>,
 }
 
-/// What an export states in addition to its shots.
+/// Data of an export next to its shots.
 struct Said {
     kind: CaptureKind,
-    /// What its poses are, as its program writes them.
+    /// Convention of its poses.
     convention: Convention,
     fps: Option<f64>,
     points: Option<PointCloud>,
@@ -70,8 +70,8 @@ struct Said {
     notes: Vec<String>,
 }
 
-/// Sorted names of a folder's images, one of each name whatever its ending, and a remark about those left out. Errors: images
-/// of one name differ in size.
+/// Sorted names of a folder's images, one of each name whatever its ending, and a remark about those left out. Errors:
+/// images of one name differ in size.
 fn images_of(folder: &Path) -> Result<(Vec<String>, Option<String>)> {
     let mut twins = Twins::default();
     let kept = twins.single(rig::image_names(folder).iter().map(|name| folder.join(name)).collect())?;
@@ -84,7 +84,7 @@ fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
     Convention::NERF.read_as(pose::checked(Se3::from_rows(rows))?, Poses::STATED)
 }
 
-/// The capture of some shots: of one moving camera where they have times, else as their names say.
+/// The capture of some shots: of one moving camera where they have times, else as their names specify.
 fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<RawCapture> {
     let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
@@ -124,7 +124,8 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
 /// How folders begin whose images are not the photos, in addition to those of masks: depth, reduced copies.
 const OTHERS: [&str; 3] = ["depth", "images_", "."];
 
-/// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels below.
+/// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels
+/// below.
 struct Images {
     found: BTreeMap<String, Vec<PathBuf>>,
     root: PathBuf,
@@ -164,7 +165,7 @@ impl Images {
                     first.display(),
                     second.display()
                 );
-                // A copy in another size would be as good; which one is meant is the user's to say.
+                // A copy in another size would be as good; the user must state which one is meant.
                 Err(Error::input(what).remedy("Move the others out of the capture's folder."))
             }
         }
@@ -202,7 +203,7 @@ fn only_points(root: &Path, notes: &mut Vec<String>) -> Result<Option<PointCloud
     }
 }
 
-/// Says how many images of an export have no pose.
+/// Reports how many images of an export have no pose.
 fn without_pose(count: usize, of: usize, warnings: &mut Vec<String>) {
     if count > 0 {
         warnings.push(format!("{count} of {of} images have no pose and are left out: they were not aligned."));

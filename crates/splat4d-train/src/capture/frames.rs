@@ -16,18 +16,18 @@ pub struct Picture {
     pub mask: Option<Planes<f32>>,
     /// 1 channel, 0 = a pixel that the lens never filled and that must not count.
     pub weight: Option<Planes<f32>>,
-    /// How far away what it shows is, as far as that is known.
+    /// Its depth, where known.
     pub depth: Option<Depth>,
-    /// Where its pixels go, as far as that is known.
+    /// Its optical flow, where known.
     pub flow: Option<Flow>,
 }
 
-/// Known depth of an image, as a loss sees it.
+/// Known depth of an image, for a loss.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthTruth<'a, F = f32> {
     /// [1, h, w]; 0: not known.
     pub values: &'a Planes<F>,
-    /// What they are.
+    /// Their kind.
     pub kind: DepthKind,
 }
 
@@ -36,7 +36,7 @@ pub struct DepthTruth<'a, F = f32> {
 pub struct Depth {
     /// [1, h, w]; 0: not known.
     pub values: Planes<f32>,
-    /// What they are.
+    /// Their kind.
     pub kind: DepthKind,
 }
 
@@ -46,7 +46,7 @@ impl Depth {
         DepthTruth { values: &self.values, kind: self.kind }
     }
 
-    /// Where four pixels show one surface.
+    /// Largest ratio of depths of four pixels on one surface.
     fn halve(&mut self) {
         let map = &mut self.values;
         map.data = depth::reduce(&map.data, map.width, map.height, 2);
@@ -54,7 +54,7 @@ impl Depth {
     }
 }
 
-/// Known optical flow of an image, as a loss sees it.
+/// Known optical flow of an image, for a loss.
 #[derive(Clone, Copy, Debug)]
 pub struct FlowTruth<'a, F = f32> {
     /// When the pixels arrive.
@@ -147,7 +147,7 @@ pub trait Frames: Send + Sync {
     }
     /// Reads frame i.
     fn load(&self, i: usize, out: &mut Picture) -> Result<()>;
-    /// These will be asked for soon; must not change any result.
+    /// These will be requested soon; must not change any result.
     fn prefetch(&self, _frames: &[usize]) {}
 }
 

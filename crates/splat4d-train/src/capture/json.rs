@@ -159,8 +159,8 @@ impl<'a> Node<'a> {
         self.pose4(Poses::STATED)
     }
 
-    /// The matrix of a pose. One that is written column by column has its translation in the last row: it is moved to the
-    /// last column where `poses` say so, which leaves the rotation transposed.
+    /// The matrix of a pose. One that is written column by column has its translation in the last row: it is moved to
+    /// the last column where `poses` specify it, which leaves the rotation transposed.
     pub(crate) fn pose4(&self, poses: Poses) -> Result<[[f64; 4]; 4]> {
         const LAST: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
         let mut rows = self.rows::<4>(3..=4)?;

@@ -1,6 +1,6 @@
 //! Label masks on disk: grey images of 8 or 16 bits whose values number the capture's labels.
 //!
-//! The largest value of the depth (255 or 65535) stands for what is not labelled.
+//! The largest value of the depth (255 or 65535) represents what is not labelled.
 
 use super::lens::Distortion;
 use super::picture::{self, Samples};
@@ -14,7 +14,8 @@ use std::path::Path;
 pub(crate) const UNKNOWN: u8 = u8::MAX;
 const _: () = assert!(MOST_LABELS <= UNKNOWN as usize);
 
-/// A frame's labels, [height, width] of its view, [`UNKNOWN`] where there is none; `None`: the frame has no mask of labels.
+/// A frame's labels, [height, width] of its view, [`UNKNOWN`] where there is none; `None`: the frame has no mask of
+/// labels.
 ///
 /// Errors: the mask is no image, of another size than the frame's image, in colour, or has a value without a name.
 pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> {
@@ -37,7 +38,7 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> 
 }
 
 fn decode(path: &Path, camera: &Camera, count: usize) -> Result<Vec<u8>> {
-    let raster = picture::decode_beside(path, "mask of labels", camera)?;
+    let raster = picture::decode_companion(path, "mask of labels", camera)?;
     let remedy = "Write grey PNGs of 8 or 16 bits: 0 for the first label of `labels`, 1 for the second, and the \
                   largest value (255, 65535) where the label is unknown";
     let n = raster.width * raster.height;

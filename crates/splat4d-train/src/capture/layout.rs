@@ -21,7 +21,7 @@ const MODELS: &[&str] = &[
     colmap::WORKSPACES[2],
     colmap::WORKSPACES[3],
 ];
-/// A model's other files, which stand for it as its cameras do.
+/// A model's other files, which represent it as its cameras do.
 const MODEL_FILES: [&str; 4] = ["images.bin", "images.txt", "points3D.bin", "points3D.txt"];
 
 /// N3DV's marker, which single-camera LLFF folders have too.
@@ -76,7 +76,7 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<RawCapture> 
     Ok(take)
 }
 
-/// Says which of several COLMAP models was read.
+/// Reports which of several COLMAP models was read.
 fn remark_models(take: &mut RawCapture, path: &Path, marker: &str, unread: &[&str]) {
     // One model as two files.
     let unread: Vec<&&str> =
@@ -110,7 +110,8 @@ fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
     if marker != colmap::SPARSE {
         return colmap::is_marker(file);
     }
-    // An empty `sparse` is said to be empty, and one without images to have none; but workspaces with images go first.
+    // An empty `sparse` is reported as empty, and one without images as having none; but workspaces with images have
+    // priority.
     let own_images = |workspace: &&str| {
         let model = path.join(workspace);
         colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))
@@ -138,9 +139,9 @@ pub(super) fn is_capture(folder: &Path) -> bool {
     READERS.iter().any(|(marker, _)| is_there(folder, &names, marker)) || foreign::is_there(folder)
 }
 
-/// Says which of several layouts was read, why, and how to choose another.
+/// Reports which of several layouts was read, why, and how to choose another.
 fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
-    // Files of one family describe the same images, and a model next to poses was asked for its points.
+    // Files of one family describe the same images, and a model next to poses was used for its points.
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others
         .iter()
@@ -162,7 +163,7 @@ fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
         ));
     }
 }
-/// Why a folder is no capture, and what to do about it.
+/// Why a folder is not a capture, and what to do about it.
 fn unknown_layout(root: &Path, named: &Path) -> Error {
     for (marker, what) in FOREIGN {
         if root.join(marker).exists() {

@@ -1,6 +1,6 @@
 //! Lens distortion, forwards and backwards, on normalised image coordinates (x/z, y/z).
 //!
-//! Radial polynomials fold back beyond some radius; rays beyond it never reach the sensor, so both directions say
+//! Radial polynomials fold back beyond some radius; rays beyond it never reach the sensor, so both directions return
 //! `None` there instead of inventing a pixel.
 
 use splat4d::scene::Lens;
@@ -49,7 +49,7 @@ impl Distortion {
         matches!(self.lens, Lens::Pinhole)
     }
 
-    /// Where the ray (x, y, 1) lands on the normalised sensor; `None` beyond the fold.
+    /// Projection of the ray (x, y, 1) to the normalised sensor; `None` beyond the fold.
     pub fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let r = x.hypot(y);
         match self.lens {
@@ -136,7 +136,7 @@ fn ahead(at: [f64; 2], theta: f64) -> Option<[f64; 2]> {
     (theta < std::f64::consts::FRAC_PI_2).then(|| along(at, theta.tan()))
 }
 
-/// RAD_TAN_THIN_PRISM_FISHEYE numbers its tangential terms the other way round than Brown does.
+/// RAD_TAN_THIN_PRISM_FISHEYE numbers its tangential terms in the opposite order to Brown.
 fn swapped([p0, p1]: [f64; 2]) -> [f64; 2] {
     [p1, p0]
 }

@@ -1,4 +1,5 @@
-//! LLFF captures: `poses_bounds.npy`, one row per image, and the images of one camera in a folder, in the order of the rows.
+//! LLFF captures: `poses_bounds.npy`, one row per image, and the images of one camera in a folder, in the order of the
+//! rows.
 
 use super::account::Account;
 use super::convention::Convention;
@@ -10,7 +11,7 @@ use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Reads poses and images; names say whether they show one time.
+/// Reads poses and images; names specify whether they show one time.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let rows = n3dv::rows(marker)?;

@@ -1,8 +1,9 @@
 //! Finds the files that a capture names: one lookup for every layout.
 //!
-//! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending, Unicode
-//! normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact name goes
-//! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
+//! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending,
+//! Unicode normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact
+//! name has priority; else the one file that fits is taken, and one remark counts such names. Several files that fit
+//! are an error.
 
 mod twins;
 
@@ -18,10 +19,10 @@ use unicode_normalization::UnicodeNormalization;
 
 pub(super) use twins::Twins;
 
-/// What names of folders have in which other programs keep masks, whatever white means there.
+/// Parts of names of folders in which other programs keep masks, with either polarity.
 const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 
-/// Folders in which images usually lie, below that of the capture.
+/// Folders that usually contain images, below that of the capture.
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
 /// How names of folders begin that hold other things than images, though their files may be called like these.
 const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
@@ -65,7 +66,7 @@ struct Listing {
     stems: BTreeMap<String, Vec<String>>,
 }
 
-/// Looks files up below a capture's folder.
+/// Finds files below a capture's folder.
 pub(super) struct Lookup {
     root: PathBuf,
     /// The folder of images that the user chose.
@@ -78,7 +79,7 @@ pub(super) struct Lookup {
     bare: RefCell<BTreeMap<PathBuf, Vec<String>>>,
 }
 
-/// A name as all its spellings have it: composed (NFC) and in lower case.
+/// A name's canonical form: composed (NFC) and in lower case.
 pub(super) fn fold(name: &str) -> String {
     if name.is_ascii() { name.to_ascii_lowercase() } else { name.nfc().collect::<String>().to_lowercase() }
 }
@@ -123,7 +124,7 @@ pub(super) fn key(name: &str) -> String {
 }
 
 impl Lookup {
-    /// A lookup below `root`. Errors: the folder of images that was asked for is not there.
+    /// A lookup below `root`. Errors: the folder of images that was requested is not there.
     pub(super) fn new(root: &Path, options: &CaptureOptions) -> Result<Self> {
         let chosen = options.images.as_ref().map(|name| root.join(name));
         if let Some(folder) = chosen.as_ref().filter(|f| !f.is_dir()) {
@@ -142,10 +143,10 @@ impl Lookup {
         })
     }
 
-    /// Where names relative to the capture's folder lead.
+    /// Files of names relative to the capture's folder.
     pub(super) fn bases(&self) -> Vec<PathBuf> {
         let mut bases = self.folders();
-        // The capture's own folder goes first: names may hold that of the images.
+        // The capture's own folder has priority: names may hold that of the images.
         bases.sort_by_key(|folder| *folder != self.root);
         bases
     }
@@ -213,7 +214,7 @@ impl Lookup {
         self.chosen.clone().unwrap_or_else(|| self.root.join(name))
     }
 
-    /// The image that `name` stands for, below the first of `bases` that has it. `None`: it is missing. Errors: several
+    /// The image that `name` represents, below the first of `bases` that has it. `None`: it is missing. Errors: several
     /// files fit, or two names fit one file.
     pub(super) fn image(&self, bases: &[PathBuf], name: &str) -> Result<Option<PathBuf>> {
         let plain = name.strip_prefix("./").unwrap_or(name);
@@ -240,8 +241,8 @@ impl Lookup {
         Ok(found)
     }
 
-    /// The image that `plain` leads to in another spelling, or after leading folders that are not there; `name` as it is
-    /// written. Errors: as [`Self::image`].
+    /// The image that `plain` leads to in another spelling, or after leading folders that are not there; `name` as it
+    /// is written. Errors: as [`Self::image`].
     fn spelled_otherwise(&self, bases: &[PathBuf], plain: &str, name: &str) -> Result<Option<PathBuf>> {
         let (parts, absolute) = parts(plain);
         let there = |first: &str| {
@@ -271,8 +272,8 @@ impl Lookup {
         Ok(None)
     }
 
-    /// The only image below the capture's folder with this name, whatever folder it is in. `None`: there is none, or there
-    /// are several.
+    /// The only image below the capture's folder with this name, whatever folder it is in. `None`: there is none, or
+    /// there are several.
     pub(super) fn anywhere(&self, name: &str) -> Result<Option<PathBuf>> {
         let mut folders = self.folders();
         folders.extend(self.other_folders());
@@ -382,7 +383,7 @@ impl Lookup {
         add(Way::Unicode, a != b && fold(a) == fold(b) && a.to_lowercase() != b.to_lowercase());
     }
 
-    /// Says in one remark which names were not exact.
+    /// Reports in one remark which names were not exact.
     pub(super) fn report(&self, account: &mut Account) {
         let bare = self.bare.borrow();
         if let Some((file, others)) = bare.iter().next() {
@@ -445,7 +446,7 @@ pub(super) fn unreadable(image: &Path) -> Option<PathBuf> {
     images.next().map(|name| folder.join(name))
 }
 
-/// Whether a name is that of a folder in which images usually lie.
+/// Whether a name is that of a folder that usually contains images.
 pub(super) fn is_image_folder(name: &str) -> bool {
     IMAGE_FOLDERS.contains(&name) || reduction(name).is_some()
 }
@@ -484,7 +485,7 @@ mod tests {
         (dir, lookup)
     }
 
-    /// What `name` leads to, relative to the folder, and the remark about it.
+    /// File of `name`, relative to the folder, and the remark about it.
     fn find(files: &[&str], name: &str) -> (Option<String>, String) {
         let (dir, lookup) = lookup(files);
         let found = lookup.image(&lookup.bases(), name).unwrap();
@@ -560,7 +561,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_of_names_are_compared_by_what_they_name() {
+    fn lists_of_names_are_compared_by_their_entries() {
         for name in
             ["./images/Cam0/0001.PNG", "IMAGES\\CAM0\\0001.JPG", "images\\cam0\\0001.png", "cam0/0001", "cam0/0001.jpg"]
         {

@@ -1,7 +1,7 @@
 //! Masks that are next to the images of any layout: found by the usual names, and those that fit nothing are counted.
 //!
-//! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`, `cam0/a_mask.png`,
-//! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
+//! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`,
+//! `cam0/a_mask.png`, `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
 
 use super::account::Severity;
 use super::account::{Aspect, first_names};
@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 
 /// Folders of masks, in any letter case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
-/// What names of masks have in addition to those of their images.
+/// Suffixes of mask names.
 const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
 const PREFIXES: [&str; 2] = ["mask_", "mask-"];
-/// How deep folders of masks are looked through.
+/// Search depth in folders of masks.
 const MOST_LEVELS: usize = 4;
 
 /// Gives frames without a mask theirs. Errors: two masks of one image.
@@ -145,7 +145,7 @@ fn report_others(take: &mut RawCapture, folders: &[String]) {
     take.account.add(Aspect::NotRead, severity, what);
 }
 
-/// Says how many masks and images have no counterpart.
+/// Reports how many masks and images have no counterpart.
 fn report(
     take: &mut RawCapture,
     folder: &Path,
@@ -176,7 +176,7 @@ fn report(
     }
 }
 
-/// Which of several masks of an image goes first: COLMAP's name, the image's own, then the others.
+/// Priority among several masks of an image: COLMAP's name, the image's own, then the others.
 fn rank(mask: &str, image: &str) -> usize {
     let file = mask.rsplit('/').next().unwrap_or(mask);
     let (own, appended) = (fold(without_ending(file)), fold(file));

@@ -2,8 +2,8 @@
 //!
 //! [`Capture::open`] identifies the layout of a folder, reads poses and times, checks them and converts them to one
 //! form: pinhole cameras with OpenCV axes, seconds, and one held-out split. An [`ImageStore`] decodes images on demand
-//! within a byte budget. Every reader produces a `RawCapture` (the content of the files); `assemble` alone turns takes into
-//! captures, so all layouts are checked alike.
+//! within a byte budget. Every reader produces a `RawCapture` (the content of the files); `assemble` alone turns takes
+//! into captures, so all layouts are checked alike.
 
 mod account;
 mod assemble;
@@ -78,11 +78,11 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A reader: the capture's folder and the marker file that was found, to what the files say.
+/// A reader: the capture's folder and the marker file that was found, to what the files specify.
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
-/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders) in the
-/// order in which they are looked for, with their readers.
+/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders)
+/// in search order, with their readers.
 const READERS: &[(&str, Reader)] = &[
     ("capture.json", own::read),
     (transforms::TRAIN, transforms::read),
@@ -152,9 +152,9 @@ pub struct Frame {
     pub upright: bool,
     /// The foreground mask file (white = foreground).
     pub mask: Option<PathBuf>,
-    /// How far away what its pixels show is.
+    /// Its depth map.
     pub depth: Option<DepthFile>,
-    /// Where its pixels go.
+    /// Its optical flow.
     pub flow: Option<FlowFile>,
     /// The mask of labels: its values number [`Capture::labels`].
     pub labels: Option<PathBuf>,
@@ -167,7 +167,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// Whether it is known where its pixels go.
+    /// Whether its optical flow is known.
     pub fn has_flow(&self) -> bool {
         self.flow.is_some()
     }
@@ -227,10 +227,9 @@ pub struct Capture {
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
     /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
-    /// photo of a
-    /// time, or stands for many.
+    /// photo of a time, or represents many.
     pub named: bool,
-    /// All images, or those that were asked for ([`CaptureOptions::frames`]).
+    /// All images, or those that were requested ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
     /// The whole capture, whatever of it is listed.
     pub take: Extent,
@@ -242,7 +241,7 @@ pub struct Capture {
     pub validation: Vec<usize>,
     /// Indices of the frames after the observed part, of every camera; see `observe`.
     pub future: Vec<usize>,
-    /// Where the times are from.
+    /// Source of the times.
     pub timing: Timing,
     /// Frames per second.
     pub fps: f64,
@@ -250,7 +249,7 @@ pub struct Capture {
     pub points: Option<PointCloud>,
     /// The background of transparent pixels, sRGB from 0 to 1; `None`: the images have no alpha.
     pub background: Option<[f32; 3]>,
-    /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
+    /// Offset subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
     /// origin ([`splat4d::scene::offset`]).
     pub offset: [f64; 3],
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
@@ -259,17 +258,17 @@ pub struct Capture {
     pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
-    /// What the layout states that poses are.
+    /// Pose convention of the layout.
     pub convention: Convention,
-    /// What they were read as instead.
+    /// Convention that was used instead.
     pub poses: Poses,
-    /// What its lenses recorded: black borders, or none.
+    /// Recorded area of its lenses: black borders, or none.
     pub lenses: Lenses,
-    /// What was not found, not read or assumed.
+    /// Content not found, not read or assumed.
     pub account: Vec<Remark>,
     /// The reader's warnings, a sentence or two each.
     pub warnings: Vec<String>,
-    /// What the reader chose or assumed that is no cause for worry, a sentence or two each.
+    /// Harmless choices and assumptions of the reader, a sentence or two each.
     pub notes: Vec<String>,
 }
 
@@ -279,7 +278,7 @@ struct RawCapture {
     root: PathBuf,
     kind: CaptureKind,
     cameras: Vec<String>,
-    /// Whether the data set distinguishes cameras; else one entry may stand for many.
+    /// Whether the data set distinguishes cameras; else one entry may represent many.
     named: bool,
     timing: Timing,
     frames: Vec<RawFrame>,
@@ -299,7 +298,7 @@ struct RawCapture {
     warnings: Vec<String>,
     notes: Vec<String>,
     account: Account,
-    /// What the layout states that poses are.
+    /// Pose convention of the layout.
     convention: Convention,
 }
 
@@ -397,7 +396,7 @@ impl Capture {
         times
     }
 
-    /// Adds points to its own, and draws as near as they come; `near`: as [`CaptureOptions::near`].
+    /// Adds points to its own, and lowers the near plane to the nearest; `near`: as [`CaptureOptions::near`].
     pub(crate) fn add_points(&mut self, mut more: PointCloud, near: f64) {
         let points = self.points.get_or_insert_default();
         points.points.append(&mut more.points);
@@ -460,7 +459,7 @@ pub fn is_metadata(path: &Path) -> bool {
     layout::is_metadata(path)
 }
 
-/// Whether a folder holds a capture, by the files in it; whether they can be read is not said.
+/// Whether a folder holds a capture, by the files in it; they need not be readable.
 pub fn is_folder(path: &Path) -> bool {
     path.is_dir() && layout::is_capture(path)
 }

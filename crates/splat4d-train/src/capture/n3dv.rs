@@ -25,7 +25,7 @@ const POINTS: &[&str] = &["points.ply", "points3D.ply", "points3D_downsample2.pl
 
 /// Folder of the notes of extracted frames (`splat4d_import::shipped`).
 const NOTES: &str = "import";
-/// Rates are stated in steps of this, frames a second: intervals in files are rounded.
+/// Rates are stated in steps of this, frames per second: intervals in files are rounded.
 const WHOLE_RATE: f64 = 0.01;
 
 /// A folder of frames: its camera's name and the images.
@@ -34,7 +34,7 @@ struct Folder {
     images: Vec<PathBuf>,
 }
 
-/// Whether this looks like an N3DV take rather than a single-camera LLFF folder.
+/// Whether this is probably an N3DV take and not a single-camera LLFF folder.
 pub(super) fn applies(root: &Path) -> bool {
     !folders(root).is_empty() || !videos(root).is_empty()
 }
@@ -112,8 +112,8 @@ fn extracted_rate(root: &Path, camera: &str) -> Option<f64> {
     super::options::check_rate("frame rate", rate).ok().map(|()| rate)
 }
 
-/// The row of poses that each camera has, of so many: in the order of names; or, where cameras are missing, by the number in the
-/// name, which counts from 0. `None`: they do not fit.
+/// The row of poses that each camera has, of this many: in the order of names; or, where cameras are missing, by the
+/// number in the name, which counts from 0. `None`: they do not fit.
 pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
     if names.len() == rows {
         return Some((0..rows).collect());
@@ -124,7 +124,7 @@ pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
     (fit && names.len() < rows).then_some(numbers)
 }
 
-/// What there is to say about the rows that cameras have.
+/// Remarks about the rows that cameras have.
 pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severity, String)> {
     let mut out = Vec::new();
     if which.len() < rows {
@@ -150,8 +150,8 @@ pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severi
     out
 }
 
-/// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does not
-/// shift those after it; else their order.
+/// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does
+/// not shift those after it; else their order.
 fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
     let named = |image: &PathBuf| rig::trailing_number(&image.file_name()?.to_string_lossy());
     let told: Option<Vec<Vec<usize>>> =
@@ -160,7 +160,7 @@ fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
     let Some(mut told) = told else { return in_order() };
     let all: BTreeSet<usize> = told.iter().flatten().copied().collect();
     let (Some(&first), Some(&last)) = (all.first(), all.last()) else { return in_order() };
-    // Cameras that number their frames apart, or share a number, say nothing of each other's time.
+    // Cameras that number their frames apart, or share a number, carry no information about each other's time.
     let apart = (0..told.len()).any(|c| {
         let others: BTreeSet<usize> =
             told.iter().enumerate().filter(|(k, _)| *k != c).flat_map(|(_, n)| n.clone()).collect();
@@ -270,7 +270,7 @@ mod tests {
         let lost = names(&["cam00", "cam01", "cam03"]);
         assert_eq!(rows_of(&lost, 4), Some(vec![0, 1, 3]));
         assert!(said(&lost, 4)[0].1.contains("1 of 4 cameras"), "{:?}", said(&lost, 4));
-        // Numbers that cannot be rows, or do not count from 0, say nothing.
+        // Numbers that cannot be rows, or do not count from 0, carry no information.
         assert_eq!(rows_of(&all, 4), None);
         assert_eq!(rows_of(&names(&["cam01", "cam02"]), 3), None);
         assert_eq!(rows_of(&names(&["left", "right"]), 3), None);

@@ -2,9 +2,9 @@
 //! `scene.json`, `points.npy`, and images in `rgb/1x` or smaller.
 //!
 //! A camera file holds `orientation` (world to camera, OpenCV axes), `position` (its centre), `focal_length`,
-//! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
-//! the images at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points
-//! alike.
+//! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width,
+//! height] of the images at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras
+//! and points alike.
 
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
@@ -73,7 +73,7 @@ struct Lists {
 }
 
 impl Lists {
-    /// From `dataset.json`, and DyCheck's `splits/train.json` and `splits/val.json`, which go first.
+    /// From `dataset.json`, and DyCheck's `splits/train.json` and `splits/val.json`, which have priority.
     fn read(root: &Path, marker: &Path, account: &mut Account) -> Result<Self> {
         let list = |path: &Path, key: &str| -> Result<Vec<String>> {
             let value = json::read(path)?;
@@ -146,7 +146,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             let own = about.get(id).and_then(|n| n.opt(key)?.map(|n| n.count()).transpose());
             own.map_err(|e| e.at(path.display()))
         };
-        // Warp codes count times; later takes say it in so many words.
+        // Warp codes count times; later takes state it explicitly.
         let index = match (of("time_id")?, of("warp_id")?, of("appearance_id")?) {
             (Some(n), ..) | (_, Some(n), _) | (.., Some(n)) => n,
             _ => {

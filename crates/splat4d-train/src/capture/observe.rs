@@ -10,9 +10,10 @@ impl Capture {
     /// Keeps the first `share` of the clip, above 0 and below 1, for training and measuring; every later frame becomes
     /// [`future`](Self::future), whatever its purpose was. `near`: as [`CaptureOptions::near`](super::CaptureOptions).
     ///
-    /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out frames.
-    /// With later images go what belongs to them: initial points with later times, and optical flow into the future. A
-    /// capture's own points without times are taken at their word. Errors: one time, a share that leaves nothing.
+    /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out
+    /// frames. Removing later images also removes their priors: initial points with later times, and optical flow into
+    /// the future. A capture's own points without times are taken at their word. Errors: one time, a share that leaves
+    /// nothing.
     pub(crate) fn observe(&mut self, share: f64, near: f64) -> Result<()> {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));
         let times = || self.train.iter().chain(&self.held).map(|&i| self.frames[i].time.0);
@@ -47,7 +48,7 @@ impl Capture {
             points.colors = kept.iter().map(|&i| points.colors[i]).collect();
             points.times = kept.iter().map(|&i| points.times[i]).collect();
         }
-        // Where moving cameras will stand states how large the scene is.
+        // Where moving cameras will be states how large the scene is.
         let near = assemble::near(self, near);
         self.frames.iter_mut().for_each(|f| f.view.near = near);
         Ok(())

@@ -1,4 +1,4 @@
-//! Options of a capture in addition to where it lies.
+//! Options of a capture next to its path.
 
 use super::convention::Poses;
 use crate::settings::{Value, choices, settings};
@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
 pub(super) type Lens100 = Vec<i64>;
 
-/// What the lenses of a capture recorded, as far as they were looked at.
+/// Image areas that the lenses of a capture recorded, as far as examined.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Lenses(pub(super) BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
 
@@ -76,13 +76,13 @@ impl Value for Option<HoldOut> {
     }
 }
 
-/// Default of `capture.near`: a camera that is mounted in a wall looks through the wall's own splats, and haze in
-/// front of places where no training camera stands costs nothing. PanopticSports basketball, four minutes, held-out
-/// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 draw nothing nearer than 0.2 units, about that share), 28.1 with this.
+/// Default of `capture.near`: a camera that is mounted in a wall is behind the wall's own splats, and haze in front of
+/// places where no training camera is costs nothing. PanopticSports basketball, four minutes, held-out cameras: 27.1 dB
+/// with 0.05 (Kerbl et al. 2023 render nothing nearer than 0.2 units, about that share), 28.1 with this.
 const NEAR: f64 = 0.2;
 
 choices! {
-    /// What images are that state no times.
+    /// How to interpret images without times.
     pub enum Sequence {
         /// By their names: a film where they are numbered like its frames, else photos.
         Auto = "auto",
@@ -94,7 +94,7 @@ choices! {
 }
 
 choices! {
-    /// Whose pixels poses and intrinsics describe where images have an EXIF orientation.
+    /// Pixels (stored or upright) that poses describe if images have an EXIF orientation.
     pub enum Exif {
         /// By the layout, else by the images' sizes.
         Auto = "auto",
@@ -106,7 +106,7 @@ choices! {
 }
 
 choices! {
-    /// What becomes of black borders of images.
+    /// Treatment of black borders of images.
     pub enum Borders {
         /// They are found, and neither trained nor scored.
         Auto = "auto",
@@ -116,7 +116,7 @@ choices! {
 }
 
 choices! {
-    /// What the times of a capture count.
+    /// Unit of a capture's times.
     pub enum Times {
         /// As their range, steps and the images' names show.
         Auto = "auto",
@@ -130,7 +130,7 @@ choices! {
 }
 
 choices! {
-    /// What becomes of images without a pose of their own, whose camera has another image with one.
+    /// Treatment of images without a pose of their own, whose camera has another image with one.
     pub enum Unregistered {
         /// They share that pose where names show a fixed rig (`cam00/0001.png`), else they are left out.
         Auto = "auto",
@@ -142,7 +142,7 @@ choices! {
 }
 
 choices! {
-    /// Where the optical flow of images is from.
+    /// Source of optical flow.
     pub enum FlowSource {
         /// The capture's files; where it brings none there is none.
         Files = "files",
@@ -152,7 +152,7 @@ choices! {
 }
 
 settings! {
-    /// What is read of the capture, and how.
+    /// Options of reading a capture.
     pub struct CaptureSettings {
         /// Images are reduced by this factor (mean of k×k boxes).
         downscale: usize = 1 => at_least(1);
@@ -170,7 +170,7 @@ settings! {
         /// Near distance of cameras, of the extent; less if the capture's points are nearer, a quarter of it without
         /// points.
         near: f64 = NEAR => below_one().unit("extents");
-        /// Share of the clip that training sees; later frames only score forecasts. 1: all.
+        /// Share of the clip for training; later frames only score forecasts. 1: all.
         observe: f64 = 1.0 => share();
         /// Folder of images instead of the capture's, such as "images_4"; empty: the capture's.
         images: Text = Text::default();
@@ -199,13 +199,13 @@ settings! {
 /// How a capture is read. `CaptureOptions::default()` follows the data set's own conventions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
-    /// Images become means of k×k boxes; 1 leaves them as they are. Rows and columns that fill no box are cut off.
+    /// Images become means of k×k boxes; 1 keeps them. Rows and columns that fill no box are cut off.
     pub downscale: usize,
     /// Held-out frames; `None` follows the data set's convention.
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// What images are that state no times.
+    /// How to interpret images without times.
     pub sequence: Sequence,
     /// The background of transparent pixels, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
@@ -214,28 +214,27 @@ pub struct CaptureOptions {
     pub unit_time_seconds: Option<f64>,
     /// Most points of the initial cloud; larger clouds are thinned by voxel.
     pub max_points: usize,
-    /// How near to a camera splats are drawn, as a share of the cameras' extent; less where the capture's points come
-    /// nearer, and a quarter of it where it has none.
+    /// How near to a camera splats are rendered, as a share of the cameras' extent; less where the capture's points
+    /// come nearer, and a quarter of it where it has none.
     pub near: f64,
     /// The folder of images below the capture's, in place of the one that the capture names.
     pub images: Option<String>,
-    /// What poses are written as where it is not what the layout states.
+    /// Convention of the poses if it is not that of the layout.
     pub poses: Poses,
-    /// Whose pixels poses and intrinsics describe.
+    /// Pixels (stored or upright) that poses describe.
     pub exif: Exif,
-    /// What becomes of black borders.
+    /// Treatment of black borders.
     pub borders: Borders,
-    /// What times count.
+    /// Unit of times.
     pub times: Times,
-    /// What becomes of images without a pose of their own.
+    /// Treatment of images without a pose of their own.
     pub unregistered: Unregistered,
     /// Share of the images that may be missing.
     pub max_missing: f64,
     /// Only images with these frame numbers are listed, so that memory does not grow with the capture; empty: all. What
-    /// they
-    /// are for (training, held out) is what it is in the whole capture.
+    /// they are for (training, held out) is as in the whole capture.
     pub frames: Vec<Range<usize>>,
-    /// What is known of the lenses already, from another part of the capture; else images are looked at.
+    /// Known properties of the lenses, from another part of the capture; else images are examined.
     pub lenses: Lenses,
 }
 

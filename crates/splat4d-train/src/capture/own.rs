@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The version of the format that this reader knows.
+/// The version of the format that this reader supports.
 const VERSION: usize = 1;
 const TOP_KEYS: &[&str] = &[
     "version",
@@ -138,7 +138,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
     })
 }
 
-/// Whether the part that is wanted can be read by itself: of fixed cameras, which are held out as a whole or not at all.
+/// Whether the part that is needed can be read alone: of fixed cameras, which are held out as a whole or not at all.
 /// The rest can only be determined from the whole.
 fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
     let by_camera = match told {
@@ -348,7 +348,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
-    // Where the pixels of the last frame go is unknown.
+    // The flow of the last frame is unknown.
     if let Some(last) = frames[first..].last_mut() {
         last.flow = None;
     }

@@ -1,5 +1,5 @@
-//! Equirectangular panoramas (COLMAP's and Nerfstudio's EQUIRECTANGULAR) become six pinhole views each, the faces of a cube.
-//! Views are cut out of the panorama when an image is loaded; nothing is written.
+//! Equirectangular panoramas (COLMAP's and Nerfstudio's EQUIRECTANGULAR) become six pinhole views each, the faces of a
+//! cube. Views are cut out of the panorama when an image is loaded; nothing is written.
 
 use super::{HoldOut, RawCapture, RawFrame, Split, Timing};
 use splat4d::math::Se3;
@@ -42,7 +42,7 @@ pub(super) fn split(take: &mut RawCapture, hold_out: Option<&HoldOut>) -> Result
     }
     let frames = std::mem::take(&mut take.frames);
     let names = std::mem::take(&mut take.cameras);
-    // Places of one time without a rig: whole panoramas are held out, unless something else is asked for.
+    // Places of one time without a rig: whole panoramas are held out, unless something else is requested.
     let by_place = take.timing == Timing::Moment
         && !take.named
         && hold_out.or(take.hold_out.as_ref()).is_none()
@@ -108,7 +108,7 @@ fn view(frame: &RawFrame, turn: &[[f64; 3]; 3], size: [usize; 2]) -> RawFrame {
     RawFrame { mask: frame.mask.clone(), split: frame.split, ..RawFrame::new(place, source, frame.image.clone()) }
 }
 
-/// The camera of the stored image, as far as its size goes: of a panorama the whole of it.
+/// The camera of the stored image, by its size: of a panorama the whole of it.
 pub(super) fn stored(source: &Camera) -> Camera {
     match source.lens {
         Lens::Equirectangular { size: [width, height], .. } => Camera { width, height, ..source.clone() },

@@ -18,7 +18,7 @@ pub(super) struct Header {
     pub stored: (usize, usize),
     /// Whether there is an alpha channel.
     pub alpha: bool,
-    /// What EXIF states is to be done with the pixels.
+    /// Orientation of the pixels from EXIF.
     orientation: Orientation,
 }
 
@@ -38,9 +38,9 @@ impl Header {
 /// Decoded samples.
 #[derive(Debug, PartialEq)]
 pub(super) enum Samples {
-    /// 8 bits a sample.
+    /// 8 bits per sample.
     Eight(Vec<u8>),
-    /// 16 bits a sample.
+    /// 16 bits per sample.
     Sixteen(Vec<u16>),
 }
 
@@ -79,11 +79,11 @@ fn is_jpeg(bytes: &[u8]) -> bool {
 /// Bytes at the start of a file that identify its format.
 const HEAD: usize = 64;
 
-/// What to do with images of other formats.
+/// Remedy for images of other formats.
 const CONVERT: &str = "Convert the images to JPEG or PNG under the same names (for instance with ffmpeg or ImageMagick): \
                        another ending is found.";
 
-/// What a file is instead of an image that can be read, by its first bytes, and what to do. `None`: that is not known.
+/// Kind of an unreadable file by its first bytes, and a remedy. `None`: that is not known.
 fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     let format = match head {
         [] => return Some(("the file is empty (0 bytes)", "Copy or extract it again, or delete it.")),
@@ -236,7 +236,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
 }
 
 /// An error unless what is next to an image, `what` in words, is of that image's size.
-pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
+pub(super) fn check_companion(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size == (camera.width, camera.height) {
         return Ok(());
     }
@@ -260,9 +260,9 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
 /// Decodes what is next to an image, `what` in words. Errors before its pixels are read where its size is not that
 /// of the
 /// stored image.
-pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
+pub(super) fn decode_companion(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
     let header = header(path)?;
-    check_beside(path, what, header.upright(), camera)?;
+    check_companion(path, what, header.upright(), camera)?;
     decode(path, None)
 }
 
@@ -380,8 +380,8 @@ const LABELS: u16 = 16;
 
 /// A mask's values from 0 to 1, one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
 ///
-/// Some tools write masks of zeros and ones, or of the numbers of labels: where no value is above 16, all but 0 count as
-/// white. Others write the mask into the alpha of an image of one colour.
+/// Some tools write masks of zeros and ones, or of the numbers of labels: where no value is above 16, all but 0 count
+/// as white. Others write the mask into the alpha of an image of one colour.
 pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {
     let n = raster.width * raster.height;
     let of = |channel: usize, p: usize| match &raster.samples {

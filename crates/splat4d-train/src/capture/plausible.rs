@@ -1,4 +1,5 @@
-//! Whether intrinsics and lenses can be those of the images: principal point, field of view, bend. Cheap: opens no image.
+//! Whether intrinsics and lenses can be those of the images: principal point, field of view, bend. Cheap: opens no
+//! image.
 
 use super::account::Aspect;
 use super::account::Severity;
@@ -9,8 +10,8 @@ use std::collections::BTreeSet;
 
 /// Of the side: a principal point that is farther from the middle is that of another size, or of a cropped image.
 const OFF_CENTRE: f64 = 0.2;
-/// Fields of view along the longer side that photos with straight lines have, degrees: super telephoto to the widest lenses
-/// (10 mm in front of 36 mm film: 122°).
+/// Fields of view along the longer side that photos with straight lines have, degrees: super telephoto to the widest
+/// lenses (10 mm in front of 36 mm film: 122°).
 const FIELDS: [f64; 2] = [2.0, 130.0];
 /// By how much a lens of straight lines moves the middle of an image's side at most, as a ratio: action cameras stay
 /// below 1.5.
@@ -80,7 +81,7 @@ fn odd_bend(camera: &Camera) -> Option<String> {
     (most > MOST_BEND).then(|| format!("the lens moves the middle of a side by a factor of {most:.1} from the centre"))
 }
 
-/// Whether a camera stands for a whole panorama.
+/// Whether a camera represents a whole panorama.
 fn is_whole_sphere(camera: &Camera) -> bool {
     matches!(camera.lens, Lens::Equirectangular { .. })
 }

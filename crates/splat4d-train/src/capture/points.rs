@@ -29,13 +29,13 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
     Ok(cloud)
 }
 
-/// The number that stands for full colour in colours of floating point: 1, or 255 where most are above 1.
+/// The number that represents full colour in colours of floating point: 1, or 255 where most are above 1.
 pub(super) fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
     let (above, all) = colors.fold((0usize, 0usize), |(above, all), c| (above + usize::from(c > 1.0), all + 1));
     if 2 * above > all { 255.0 } else { 1.0 }
 }
 
-/// Names that MeshLab, VisualSFM and others give to colours, and what they are otherwise called.
+/// Names that MeshLab, VisualSFM and others give to colours, and the usual names.
 const COLOR_PREFIX: &[u8] = b" diffuse_";
 /// Bytes in which the header of a cloud ends: few properties are usual.
 const HEADER: usize = 1 << 14;
@@ -90,7 +90,7 @@ impl PointCloud {
         self.times.push(time);
     }
 
-    /// What was left out of the file, for a warning.
+    /// Points left out of the file, for a warning.
     pub(crate) fn loss(&self) -> Option<String> {
         let all = self.points.len() + self.left_out;
         (self.left_out > 0).then(|| {
@@ -108,7 +108,7 @@ impl PointCloud {
         }
     }
 
-    /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
+    /// All of it as a binary .ply file, which restores it exactly; `comment`: lines for its header.
     pub fn to_ply(&self, comment: &str) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\n{comment}\nelement vertex {}\nproperty double x\nproperty double y\n\
@@ -125,7 +125,7 @@ impl PointCloud {
     }
 
     /// Thins the cloud to at most `max_points`: the finest voxel grid that leaves few enough cells, and the mean of
-    /// position and colour in each. The same cloud always gives the same result; small clouds come back unchanged.
+    /// position and colour in each. The same cloud always gives the same result; small clouds are returned unchanged.
     /// Points of different time stay apart (a cell holds one time, taken from its first point, per time value).
     pub(crate) fn voxel_downsample(&self, max_points: usize) -> Self {
         let n = self.points.len();
@@ -151,7 +151,7 @@ impl PointCloud {
         let sorted = self.cells(low, f64::exp2(coarse) / side);
         let cells: Vec<&[(Cell, usize)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let mut out = Self::default();
-        // More distinct times than points are asked for: no voxel size helps, so every n-th cell is kept.
+        // More distinct times than points are requested: no voxel size helps, so every n-th cell is kept.
         let stride = cells.len().div_ceil(max_points);
         for members in cells.iter().step_by(stride) {
             let weight = 1.0 / members.len() as f64;
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cloud_comes_back_from_its_file_bit_by_bit() {
+    fn a_cloud_round_trips_bit_for_bit() {
         let cloud = PointCloud {
             points: vec![[0.1, -2e-9, 3e7], [1.0 / 3.0, 0.0, -0.7]],
             colors: vec![[0.1, 0.2, 1.0], [0.0, 0.7, 1.0 / 3.0]],

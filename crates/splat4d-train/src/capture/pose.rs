@@ -15,8 +15,8 @@ const MAX_SHEAR: f64 = 0.02;
 const POLAR_STEPS: usize = 4;
 /// Longest side of an image, pixels: twice the largest sensors in use.
 pub(super) const MAX_SIDE: usize = 1 << 15;
-/// Farthest coordinate of a camera or a point that is accepted, scene units: sums of squares and cubes of it still fit 32-bit
-/// floats. Metres of a map are a hundred thousand times smaller.
+/// Farthest coordinate of a camera or a point that is accepted, scene units: sums of squares and cubes of it still fit
+/// 32-bit floats. Metres of a map are a hundred thousand times smaller.
 pub(super) const FARTHEST: f64 = 1e12;
 /// Shortest and longest focal length that is accepted, and farthest principal point, pixels: their products with
 /// [`FARTHEST`] and their reciprocals stay finite in 32-bit floats.
@@ -91,7 +91,7 @@ pub(super) fn check_size(width: usize, height: usize) -> Result<()> {
         .remedy(format!("Sides must be 1 to {MAX_SIDE} pixels, at most {MAX_PIXELS} in all.")))
 }
 
-/// Whether two cameras stand at one place and look the same way.
+/// Whether two cameras have one position and one orientation.
 pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
     let (p, q) = (&a.cam_from_world, &b.cam_from_world);
     let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());

@@ -25,7 +25,7 @@ const SAME: f64 = 1e-6;
 /// Errors: no reconstruction, damage, a camera with several positions.
 pub fn colmap_cameras(folder: &Path) -> Result<(Vec<PosedCamera>, Option<PointCloud>)> {
     let (shots, points) = colmap::shots(folder)?;
-    Ok((of_pictures(&shots).map_err(|e| e.at(folder.display()))?, points))
+    Ok((of_images(&shots).map_err(|e| e.at(folder.display()))?, points))
 }
 
 /// Whether a folder holds a COLMAP reconstruction, itself or in numbered folders.
@@ -39,7 +39,7 @@ pub fn is_colmap(folder: &Path) -> bool {
 pub fn transforms_cameras(path: &Path) -> Result<Vec<PosedCamera>> {
     let value = json::read(path)?;
     let root = path.parent().unwrap_or(Path::new("."));
-    let shots = posed_frames(root, &Node::root(&value)).and_then(|shots| of_pictures(&shots));
+    let shots = posed_frames(root, &Node::root(&value)).and_then(|shots| of_images(&shots));
     shots.map_err(|e| e.at(path.display()))
 }
 
@@ -53,7 +53,7 @@ pub fn check_intrinsics(k: &Intrinsics, width: usize, height: usize) -> Result<(
     super::pose::check_intrinsics(k, width, height)
 }
 
-fn of_pictures(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
+fn of_images(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let naming = rig::naming(&names);
     let mut out: Vec<PosedCamera> = Vec::new();

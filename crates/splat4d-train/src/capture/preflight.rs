@@ -10,7 +10,7 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// What of reading the capture it is about; `None`: of something else.
+    /// Related remark of reading the capture; `None`: of something else.
     pub aspect: Option<Aspect>,
     /// The finding, a sentence.
     pub what: String,
@@ -29,10 +29,9 @@ const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
 const CLOSE_DEGREES: f64 = 0.5;
 
-/// Between these angles to the nearest training camera new views end to hold, degrees: half the gap between neighbouring
-/// cameras, whose middle is seen from both sides, but nowhere less than what any two images share, and nowhere more
-/// than
-/// what was seen to hold (docs/priors.md).
+/// Between these angles to the nearest training camera new views end to hold, degrees: half the gap between
+/// neighbouring cameras, whose middle is seen from both sides, but nowhere less than what any two images share, and
+/// nowhere more than what was seen to hold (docs/priors.md).
 const REACH_DEGREES: [f64; 2] = [5.0, 15.0];
 /// Of the nearest and of the farthest training camera's distance: nearer than half of it a pixel shows what no image
 /// did.
@@ -43,7 +42,7 @@ const REACH_VIEWS: usize = 200;
 /// How far from the training cameras new views will hold: a rule, not a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reach {
-    /// The place that the cameras look at.
+    /// The common target of the cameras.
     pub center: [f64; 3],
     /// The angle there to the nearest training camera, degrees.
     pub degrees: f64,
@@ -85,7 +84,7 @@ impl Capture {
         Some(Reach { center, degrees, distances, held })
     }
 
-    /// Looks for what commonly spoils results. Cheap: opens a few depth maps, and no image.
+    /// Checks for common causes of bad results. Cheap: opens a few depth maps, and no image.
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let aspect = |text: &String| self.account.iter().find(|r| r.what == *text).map(|r| r.aspect);

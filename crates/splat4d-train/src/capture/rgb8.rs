@@ -1,4 +1,4 @@
-//! Images of bytes, as they are shown: what comes from a file before anything is done with it.
+//! 8-bit images as decoded from a file, before any processing.
 
 use super::picture::{self, Raster, Samples};
 use splat4d::Result;

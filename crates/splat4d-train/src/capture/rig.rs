@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 /// Endings of images that can be decoded.
 pub(super) const IMAGE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "webp"];
 
-/// What macOS puts next to every file on foreign disks, under its name after this.
+/// Prefix of the files that macOS adds on foreign disks.
 const APPLE_DOUBLE: &str = "._";
 
 /// Sorted names of the files and folders directly in `folder`; empty where it cannot be read.
@@ -19,7 +19,7 @@ pub(super) fn file_names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A folder whose names are listed once, when the first name is looked for that is not there as it is spelled.
+/// A folder whose names are listed once, when the first name is requested that has no exact match.
 pub(super) struct Folder<'a> {
     path: &'a Path,
     names: OnceCell<Vec<String>>,
@@ -31,7 +31,7 @@ impl<'a> Folder<'a> {
     }
 
     /// A file or folder below this one, whichever letter case its names have; where it should be if it is missing. Of
-    /// several spellings the exact one goes first, and none is taken if two others fit.
+    /// several spellings the exact one has priority, and none is taken if two others fit.
     pub(super) fn spelled(&self, name: &str) -> PathBuf {
         let exact = self.path.join(name);
         if exact.exists() {

@@ -1,10 +1,11 @@
-//! Cameras and frame numbers of images that say nothing of time: one time, or the frames of films, by their names.
+//! Cameras and frame numbers of images that carry no information about time: one time, or the frames of films, by their
+//! names.
 
 use super::{Sequence, rig};
 use splat4d::math::Se3;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Where a capture's times are from.
+/// Source of a capture's times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Timing {
@@ -16,15 +17,15 @@ pub enum Timing {
     Moment,
 }
 
-/// Who took every image, and when.
+/// Camera and time of every image.
 pub(super) struct FrameOrder {
     /// Camera names.
     pub cameras: Vec<String>,
     /// For each image its camera, its frame number and its time in seconds.
     pub frames: Vec<(usize, usize, f64)>,
-    /// Whether the data set distinguishes cameras; else one entry may stand for many.
+    /// Whether the data set distinguishes cameras; else one entry may represent many.
     pub named: bool,
-    /// Where the times are from.
+    /// Source of the times.
     pub timing: Timing,
 }
 
@@ -34,7 +35,7 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
-/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It states nothing of time.
+/// Nerfstudio's name of every image, photos and frames alike: a word and five digits. It states nothing of time.
 const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
@@ -132,8 +133,8 @@ pub(super) fn moment(names: &[&str]) -> FrameOrder {
     FrameOrder { cameras, frames, named: false, timing: Timing::Moment }
 }
 
-/// Fixed cameras whose names say otherwise (`0001/cam00.png`, `cam00_0001.png`): every pose repeats to the last bit, as that of
-/// no photo does. `None`: some do not.
+/// Fixed cameras whose names specify otherwise (`0001/cam00.png`, `cam00_0001.png`): every pose repeats to the last
+/// bit, as that of no photo does. `None`: some do not.
 fn repeated(names: &[&str], poses: &[Se3], fps: f64) -> Option<FrameOrder> {
     let bits = |p: &Se3| p.rotation.iter().flatten().chain(&p.translation).map(|v| v.to_bits()).collect::<Vec<u64>>();
     let mut views: BTreeMap<Vec<u64>, Vec<usize>> = BTreeMap::new();
@@ -157,8 +158,8 @@ fn repeated(names: &[&str], poses: &[Se3], fps: f64) -> Option<FrameOrder> {
     Some(FrameOrder { cameras, frames, named: false, timing: Timing::Numbers })
 }
 
-/// The number of each image's frame: the one in its name that differs between the images of a view and is found in other views
-/// too; without such a number, its place among the images of its view.
+/// The number of each image's frame: the one in its name that differs between the images of a view and is found in
+/// other views too; without such a number, its place among the images of its view.
 fn frame_numbers(names: &[&str], views: &[Vec<usize>]) -> Vec<usize> {
     let all: Vec<Vec<usize>> = names
         .iter()
@@ -341,7 +342,7 @@ mod tests {
             let found = of(name, Sequence::Auto);
             assert_eq!(found, (Timing::Numbers, 3, (1, 6, 0.6), true), "{}", name(0, 0));
         }
-        // Numbers that no two views share say nothing: the order counts.
+        // Numbers that no two views share carry no information: the order counts.
         let apart = of(&|c, t| format!("DSC{:04}.png", 100 * c + 7 * t), Sequence::Auto);
         assert_eq!(apart, (Timing::Numbers, 3, (1, 3, 0.3), true));
         assert_eq!(of(by_time[0], Sequence::Photos).0, Timing::Moment);

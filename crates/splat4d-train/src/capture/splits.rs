@@ -61,9 +61,9 @@ impl Lists {
         Ok(out)
     }
 
-    /// What becomes of images with these names; `None`: one is left out. Images that no list names train where only test
-    /// images are listed, are held out where only training images are, and are left out where both are. A listed name that
-    /// fits no image is a warning. Errors: no name of the training images does.
+    /// Split of images with these names; `None`: one is left out. Images that no list names train where only test
+    /// images are listed, are held out where only training images are, and are left out where both are. A listed name
+    /// that fits no image is a warning. Errors: no name of the training images does.
     pub(super) fn settle(&self, names: &[&str], account: &mut Account) -> Result<Vec<Option<Split>>> {
         let Self { train, test, validation } = self;
         if [train, test, validation].iter().all(|l| l.is_empty()) {
@@ -73,7 +73,7 @@ impl Lists {
         let known: BTreeSet<&String> = keys.iter().collect();
         let mut split_of: BTreeMap<String, Split> = BTreeMap::new();
         let mut lost = Vec::new();
-        // Only a validation list: that is what there is to measure on.
+        // Only a validation list: it is the only set to evaluate.
         let of_validation = if test.is_empty() { Split::Held } else { Split::Validation };
         for (names, split) in [(train, Split::Train), (validation, of_validation), (test, Split::Held)] {
             let mut found = 0;
@@ -114,7 +114,8 @@ impl Lists {
     }
 }
 
-/// The key of the image that a listed name stands for, perhaps after leading folders (absolute paths of another machine).
+/// The key of the image that a listed name represents, perhaps after leading folders (absolute paths of another
+/// machine).
 fn fitting(name: &str, known: &BTreeSet<&String>) -> Option<String> {
     let whole = key(name);
     let ends = whole.match_indices('/').map(|(i, _)| &whole[i + 1..]);

@@ -1,7 +1,7 @@
 //! Images on demand: decoded, composited, undistorted and downscaled, in a byte budget shared by all threads.
 //!
 //! An image is a pure function of its files and the capture's options, so neither the order of loads nor the prefetch
-//! thread nor eviction can change a result. Plain 8-bit images stay 8 bits a sample, exactly as in the file; whatever
+//! thread nor eviction can change a result. Plain 8-bit images stay 8 bits per sample, exactly as in the file; whatever
 //! was composited, resampled or averaged is kept in 16 bits, whose rounding (1/131070) is far below the half 8-bit step
 //! (1/510) that an 8-bit copy would lose, at half the memory of f32.
 
@@ -28,14 +28,14 @@ pub struct Picture {
     /// [1, height, width] part of the pixel that the original image covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
     pub valid: Option<Planes<f32>>,
-    /// [1, height, width] the depth of what pixels show, 0 where it is not known, and what kind of depth it is.
+    /// [1, height, width] depths of pixels, 0 where unknown, and their kind.
     pub depth: Option<(Planes<f32>, DepthKind)>,
-    /// [3, height, width] where its pixels go by the next frame of its camera: u right, v down in pixels, and 1 where
-    /// they are known.
+    /// [3, height, width] optical flow to the next frame of its camera: u right, v down in pixels, and 1 where they are
+    /// known.
     pub flow: Option<Planes<f32>>,
 }
 
-/// A loaded image as it is kept: planes of 8 or 16 bits.
+/// A loaded image in memory: planes of 8 or 16 bits.
 #[derive(PartialEq)]
 pub struct StoredPicture {
     width: usize,
@@ -79,7 +79,7 @@ impl StoredPicture {
         self.weights_into(self.valid.as_deref(), out)
     }
 
-    /// Writes the depth as [1, height, width] and states what kind it is; `None` (and `out` untouched) if there is none.
+    /// Writes the depth as [1, height, width] and returns its kind; `None` (and `out` untouched) if there is none.
     pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
         let (values, kind) = self.depth.as_ref()?;
         (out.channels, out.height, out.width) = (1, self.height, self.width);
@@ -161,8 +161,8 @@ impl std::fmt::Debug for StoredPicture {
 
 /// A cache of decoded images that never exceeds its byte budget.
 ///
-/// The least recently used image goes first. Images in use by callers (their `Arc`s) and the one being decoded are
-/// not counted; an image larger than the whole budget is handed out without being kept.
+/// The least recently used image is evicted first. Images in use by callers (their `Arc`s) and the one being decoded
+/// are not counted; an image larger than the whole budget is handed out without being kept.
 pub struct ImageStore {
     shared: Arc<Shared>,
     worker: Mutex<Option<JoinHandle<()>>>,
@@ -231,7 +231,8 @@ impl ImageStore {
         let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());
         if worker.is_none() {
             let shared = Arc::clone(&self.shared);
-            // Without a thread (a process limit, say) images are simply decoded when they are asked for.
+            // Without a thread (because of a process limit, for example) images are simply decoded when they are
+            // requested.
             *worker = std::thread::Builder::new().name("prefetch".into()).spawn(move || shared.work()).ok();
         }
     }
@@ -242,13 +243,13 @@ impl ImageStore {
         self.shared.lock().bytes
     }
 
-    /// Most bytes of images kept at any time so far; at most the budget.
+    /// Peak bytes of images in memory; at most the budget.
     #[cfg(test)]
     pub(crate) fn peak_bytes(&self) -> usize {
         self.shared.lock().peak
     }
 
-    /// How many images were decoded so far.
+    /// Number of decoded images.
     #[cfg(test)]
     pub(crate) fn decoded(&self) -> usize {
         self.shared.lock().loads
@@ -356,7 +357,7 @@ impl Shared {
     }
 }
 
-/// White: stands in where an image has alpha although the capture's first images had none.
+/// White: the replacement where an image has alpha although the capture's first images had none.
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Decodes a frame's image, mask, depth and flow and brings them to the frame's view.
@@ -417,7 +418,7 @@ fn read_mask(path: &Path, camera: &Camera, upright: bool) -> Result<Vec<f32>> {
         return Ok(values);
     }
     if !picture::is_resized(size, camera) {
-        picture::check_beside(path, "mask", size, camera)?;
+        picture::check_companion(path, "mask", size, camera)?;
     }
     let near = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
     let at = |p: usize| values[near(p / width, size.1, height) * size.0 + near(p % width, size.0, width)];

@@ -1,5 +1,5 @@
-//! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
-//! other names, images and videos without poses.
+//! Content of a folder that is not a capture, and how to make one of it: archives, captures above and below, files
+//! under other names, images and videos without poses.
 
 use super::account::first_names;
 use super::{colmap, lookup, rig, sequence};
@@ -7,7 +7,7 @@ use crate::path_text::in_command;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Where the videos of a rig often lie.
+/// Usual folders of a rig's videos.
 const VIDEO_FOLDER: &str = "videos";
 const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
 const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz", "r3d"];
@@ -21,10 +21,10 @@ const CHECKPOINTS: &str = "nerfstudio_models";
 const SCENE_ENDINGS: &[&str] = &["ply", "spz", "splat", "splatv", "sog", "ksplat", "glb", "s4d", "pt", "ckpt"];
 /// Bytes of a JSON file in which its keys are searched for.
 const HEAD: u64 = 1 << 16;
-/// Folders that are looked into for a capture.
+/// Folders that are searched for a capture.
 const MOST_FOLDERS: usize = 100;
 
-/// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds nothing
+/// Remedy for a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds nothing
 /// that is known.
 pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);
@@ -52,7 +52,7 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     if let Some(video) = first_video(root) {
         return Some(format!(
             "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import {} -o TAKE`, \
-             which finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
+             which finds time offsets and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
              and write a capture.json (docs/capture-format.md).",
             in_command(named),
             ffmpeg_command(&video)
@@ -70,7 +70,7 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     images.then(|| format!("It holds images, but no camera poses: {reconstruct}."))
 }
 
-/// What to do with scenes that are no captures: outputs of trainings and files of Gaussians. `None`: there are none.
+/// Remedy for scenes given as captures: outputs of trainings and files of Gaussians. `None`: there are none.
 fn scenes(root: &Path, names: &[String]) -> Option<String> {
     let checkpoints = root.join(CHECKPOINTS);
     let newest = rig::file_names(&checkpoints).into_iter().rfind(|n| ends(Path::new(n), &["ckpt"]));

@@ -27,7 +27,7 @@ pub struct Tracks {
 }
 
 impl Tracks {
-    /// Reads the tracks of a camera of this size, of so many frames. Errors name the file, the point and the frame.
+    /// Reads the tracks of a camera of this size, of this many frames. Errors name the file, the point and the frame.
     pub(super) fn read(path: &Path, size: [usize; 2], frames: usize) -> Result<Self> {
         let bytes = json::read_bytes(path)?;
         let npz = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));
@@ -80,7 +80,7 @@ impl Tracks {
         })
     }
 
-    /// A place as the view of its frame has it, pixels; `None`: no ray ends there.
+    /// A position in the pixels of its frame's view; `None`: no ray ends there.
     pub(crate) fn in_view(&self, place: [f32; 2], source: &Camera, view: &Camera) -> Option<[f64; 2]> {
         let (a, b) = (&source.intrinsics, &view.intrinsics);
         let [x, y] =

@@ -1,5 +1,5 @@
-//! `transforms_train.json` (with `_val` and `_test`) and `transforms.json`: the poses of D-NeRF, Blender, instant-ngp and
-//! Nerfstudio, OpenGL axes, camera to world; intrinsics of all frames or of each, times or none.
+//! `transforms_train.json` (with `_val` and `_test`) and `transforms.json`: the poses of D-NeRF, Blender, instant-ngp
+//! and Nerfstudio, OpenGL axes, camera to world; intrinsics of all frames or of each, times or none.
 //!
 //! `ply_file_path` and the poses are both written after `applied_transform`, so neither needs it here: the scene keeps
 //! the file's own world.
@@ -26,13 +26,13 @@ use std::path::{Path, PathBuf};
 pub(super) const TRAIN: &str = "transforms_train.json";
 /// All frames of captures in one file.
 pub(super) const ALL: &str = "transforms.json";
-/// Frames that are next to, and what they are for. The test set is what papers measure.
+/// Further files of frames, and their purpose. The test set is what papers measure.
 const OTHERS: [(&str, Split); 2] = [("transforms_val.json", Split::Validation), ("transforms_test.json", Split::Held)];
 /// Blender's world has z up.
 const BLENDER_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 /// Reads the marker and what is next to it. Cameras are distinguished by image names (`cam/frame`), else by repeated
-/// poses; times come from `time`, else from what `sequence` makes of the names.
+/// poses; times are read from `time`, else derived from the names by `sequence`.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let several = marker.file_name().is_some_and(|name| name == TRAIN);
     let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
@@ -72,7 +72,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let (file, told) = first.points.unzip();
     let points = match told {
         Some(points) => Some(points),
-        None => colmap::points_beside(root, marker, &frames, &mut warnings, &mut notes),
+        None => colmap::companion_points(root, marker, &frames, &mut warnings, &mut notes),
     };
     warnings.extend(first.warning);
     lookup.report(&mut account);

@@ -1,4 +1,4 @@
-//! Settings with which a file stays within so many bytes.
+//! Settings with which a file stays within this many bytes.
 
 use super::{Compression, Level, MOST_PRUNED, draft};
 use crate::maintenance::importance::{Scores, prune};
@@ -26,9 +26,9 @@ pub struct Trial {
     pub bytes: u64,
 }
 
-/// The gentlest settings whose file has at most `most` bytes: first `Level::Tuned` if `free` (the user asked for nothing
-/// else), then `base` without pruning, then `base` with as little pruning as possible, finally without spherical
-/// harmonics.
+/// The gentlest settings whose file has at most `most` bytes: first `Level::Tuned` if `free` (the user requested
+/// nothing else), then `base` without pruning, then `base` with as little pruning as possible, finally without
+/// spherical harmonics.
 ///
 /// `besides` are bytes that the file holds beyond its Gaussians (poster, cameras). Sizes are measured by writing, not
 /// estimated. Errors: not even the hardest settings fit; what cannot be baked.
@@ -76,7 +76,7 @@ pub fn fit(
         .remedy(format!("Give --max-mb at least {:.2}.", (least as f64 / (1.0 - MARGIN) / 1e4).ceil() / 100.0)))
 }
 
-/// Bytes of the pruned scene's file, without any fine-tuning; masks at a bit a Gaussian and key time.
+/// Bytes of the pruned scene's file, without any fine-tuning; masks at a bit per Gaussian and key time.
 fn size(scene: &Scene<f32>, scores: &Scores, c: &Compression, cameras: &[Camera]) -> Result<u64> {
     let mut pruned = scene.clone();
     for (layer, edit) in pruned.layers.iter_mut().zip(prune(scene, scores, c.prune)) {

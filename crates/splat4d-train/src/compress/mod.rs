@@ -1,7 +1,8 @@
 //! Compression: a trained scene loses its least important Gaussians, becomes a playback file, and is fine-tuned as that
 //! file.
 //!
-//! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et al. 2025).
+//! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et al.
+//! 2025).
 //! 2. The scene is baked and written, and the decoded file replaces it: a layer per page, rows in the file's order,
 //!    from any model. Masks state which Gaussians the training views show around which key time.
 //! 3. Fine-tuning through the file's codes: renders show the decoded file, gradients go to the values before rounding
@@ -64,10 +65,10 @@ pub struct Compressed {
 }
 
 /// Compresses into the run folder `dir`, or continues there. The folder's `scene.safetensors` is what a reader of the
-/// file sees.
+/// file decodes.
 ///
-/// Errors: settings out of range, a capture without training views, a folder that holds another run, a scene that cannot
-/// be baked.
+/// Errors: settings out of range, a capture without training views, a folder that holds another run, a scene that
+/// cannot be baked.
 pub fn compress(
     job: &Job<'_>,
     dir: &Path,
@@ -82,7 +83,7 @@ pub fn compress(
     let (stage, codec) = file.unzip();
     stages.extend(stage);
     if stages.is_empty() {
-        return Err(Error::input("nothing is to be done").remedy("Prune, filter or quantise."));
+        return Err(Error::input("no operation is selected").remedy("Prune, filter or quantise."));
     }
     let refined = refine(
         Refine {

@@ -6,14 +6,14 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use splat4d::format::playback::{Depths, MAX_PALETTE, WriteConfig};
 
-/// Largest share that may be pruned: beyond it nothing is left that fine-tuning could mend.
+/// Largest share that may be pruned: beyond it fine-tuning cannot recover the scene.
 pub const MOST_PRUNED: f64 = 0.98;
 /// Most rounds of pruning.
 const MOST_ROUNDS: usize = 20;
 
 macro_rules! settings {
     ($($(#[$doc:meta])* $name:ident: $type:ty = $default:expr),* $(,)?) => {
-        /// Everything that decides what compression does to a trained scene.
+        /// All settings of compression.
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default)]
         pub struct Compression {
@@ -118,8 +118,9 @@ impl Compression {
         self.fine_tune + if self.codec { self.quantise } else { 0 }
     }
 
-    /// The share of the training's rates at which fine-tuning begins. The more goes, the further has what is left to move;
-    /// where little goes, high rates only let unseen Gaussians drift (docs/benchmarks.md, "Compression").
+    /// The share of the training's rates at which fine-tuning begins. The more is pruned, the further the remaining
+    /// Gaussians have to move; if little is pruned, high rates only let unseen Gaussians drift (docs/benchmarks.md,
+    /// "Compression").
     pub(crate) fn first_rates(&self) -> f64 {
         if self.rates > 0.0 {
             return self.rates;
@@ -228,7 +229,7 @@ const RATES_BY_PRUNING: [(f64, f64); 2] = [(0.5, 0.3), (0.8, 1.0)];
 const TUNED_SHARE: f64 = 0.15;
 /// Level 2: share of the training steps that fine-tuning in floats takes.
 const FINE_TUNED_SHARE: f64 = 0.25;
-/// Level 2: share of the Gaussians that goes.
+/// Level 2: share of the Gaussians to prune.
 const PRUNED_SHARE: f64 = 0.5;
 /// Frames between key times (4DGS-1K, N3V).
 const MASK_INTERVAL: usize = 20;
@@ -243,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_come_back_and_mistakes_are_named() {
+    fn settings_round_trip_and_mistakes_are_named() {
         for level in [Level::Plain, Level::Tuned, Level::Pruned] {
             let all = Compression::level(level, 7000);
             all.check().unwrap();

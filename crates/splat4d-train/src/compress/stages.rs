@@ -18,9 +18,9 @@ use splat4d::render::Antialias;
 use splat4d::scene::Camera;
 use std::sync::Arc;
 
-/// Fine-tuning begins where a run's rates were after this share of it: what pruning left has its place already.
+/// Fine-tuning begins where a run's rates were after this share of it: the remaining Gaussians are already in position.
 const REWIND: f64 = 0.8;
-/// Rates that training keeps constant fall to this share of themselves, so that the scene comes to rest.
+/// Rates that training keeps constant fall to this share of themselves, so that the scene converges.
 const REST: f64 = 0.1;
 /// Rates of fine-tuning through the file, of those with which training ended.
 const FILE_RATES: f64 = 0.5;
@@ -40,7 +40,7 @@ impl Prepared {
         if self.plan.common.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
 
-    /// How the settings want Gaussians scored. Errors: names that are none.
+    /// How the settings score Gaussians. Errors: names that are none.
     pub(super) fn score_config(&self) -> Result<ScoreConfig> {
         let s = &self.settings;
         Ok(ScoreConfig {
@@ -68,7 +68,7 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
             let steps = s.fine_tune * (round + 1) / s.rounds - s.fine_tune * round / s.rounds;
             let mut stage = host_stage(prepared, steps)?;
             stage.name = format!("pruned {}/{}", round + 1, s.rounds);
-            // Equal shares of what is left, so that the last round leaves what was asked for.
+            // Equal shares of what is left, so that the last round reaches the requested number.
             let share = 1.0 - (1.0 - s.prune).powf(1.0 / s.rounds as f64);
             let last = round + 1 == s.rounds;
             stage.start = Some(pruning(prepared.clone(), share, filter && last));
@@ -86,19 +86,19 @@ fn host_stage(prepared: &Prepared, steps: usize) -> Result<Stage> {
     Ok(stage)
 }
 
-/// A rate of training as fine-tuning has it.
+/// A rate of training, converted for fine-tuning.
 fn settling(rate: Rate, share: f64) -> Rate {
     let start = share * rate.at(REWIND);
     Rate { start, end: (share * rate.end).min(start * REST) }
 }
 
-/// The loss that lets Gaussians fade that no view asks for.
+/// The loss that lets Gaussians fade that no view needs.
 fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     let weight = settings.opacity_reg;
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
 }
 
-/// Scores, prunes, and makes masks where they are wanted already.
+/// Scores, prunes, and makes masks where they are needed already.
 fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
     Box::new(move |scene: &mut Scene<f32>, progress| {
         if share > 0.0 {
@@ -117,7 +117,7 @@ fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
 fn masks(scene: &mut Scene<f32>, prepared: &Prepared, progress: &mut Progress<'_>) -> Result<()> {
     let config = MaskConfig { interval: prepared.settings.mask_interval, antialias: prepared.antialias() };
     key_masks(scene, prepared.frames.as_ref(), &config, &mut |done, total| {
-        progress.phase("looking which are seen", done, total);
+        progress.phase("searching visible Gaussians", done, total);
     })
 }
 

@@ -51,7 +51,7 @@ fn pruning_rounds_reach_the_target_and_keep_the_floats() {
 }
 
 #[test]
-fn the_file_is_what_was_shown_at_every_level() {
+fn the_file_equals_the_shown_scene_at_every_level() {
     let bed = Bed::new();
     for (name, level) in [("0", Level::Plain), ("1", Level::Tuned), ("2", Level::Pruned)] {
         let settings = Compression::level(level, 40);
@@ -100,5 +100,5 @@ fn a_target_size_selects_the_gentlest_sufficient_settings() {
     let nothing = Compression { codec: false, ..Compression::default() };
     let stop = AtomicBool::new(false);
     let refused = compress(&bed.job(&nothing), &bed.place.run("no"), &TrainOptions::default(), &stop, &mut |_| {});
-    assert!(refused.unwrap_err().to_string().contains("nothing is to be done"));
+    assert!(refused.unwrap_err().to_string().contains("no operation is selected"));
 }

@@ -1,5 +1,5 @@
-//! Alignment of views that were held out: their poses and clocks alone are fitted to a scene that stays as it is, so that a
-//! scene whose cameras were refined is not judged by where the others were said to stand.
+//! Alignment of views that were held out: their poses and clocks alone are fitted to an unchanged scene, so that a
+//! scene whose cameras were refined is not judged by where the others' stated poses are.
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
@@ -32,7 +32,7 @@ pub struct Align {
 }
 
 impl Align {
-    /// As a run with this recipe wants it; `None` where it refined nothing.
+    /// As in a run with this recipe; `None` where it refined nothing.
     pub fn of(capture: &Capture, recipe: &Recipe) -> Option<Self> {
         let learnt = learnable(recipe);
         let wanted = (learnt.poses || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
@@ -81,7 +81,7 @@ impl Align {
         let steps = self.settings.align_steps;
         for (done, (_, places)) in groups.iter().enumerate() {
             for step in 0..steps {
-                // Spread over the capture, so that all of its times have a say however few the steps are.
+                // Spread over the capture, so that all of its times are used even in few steps.
                 let place = places[step * places.len() / steps.min(places.len()) % places.len()];
                 let frame = info(frames[place]);
                 let stored = store.load(frames[place])?;

@@ -16,7 +16,7 @@ const OUT: usize = 3;
 /// colour, are in a plane but for rounding (f32: 6e-8, squared about 4e-15).
 const SINGULAR: f64 = 1e-12;
 
-/// Where a render's colour r goes: row c is `[m0, m1, m2, offset]`, and channel c becomes m·r + offset.
+/// A map of a render's colour r: row c is `[m0, m1, m2, offset]`, and channel c becomes m·r + offset.
 pub type ColourMatrix = [[f64; IN]; OUT];
 
 /// The matrix that changes nothing.

@@ -1,20 +1,20 @@
-//! Floaters: Gaussians that hang before few cameras. They are recognized by what their removal does to every image.
+//! Floaters: Gaussians in front of few cameras. They are recognised by the effect of their removal on every image.
 //!
-//! With L = Σ over pixels and channels of (I − T)² between render I and truth T, and r_i the part of the render that is lost
-//! without Gaussian i, removing it alone changes L by
+//! With L = Σ over pixels and channels of (I − T)² between render I and truth T, and r_i the part of the render that is
+//! lost without Gaussian i, removing it alone changes L by
 //!
 //! > Δ_i = Σ (I − r_i − T)² − Σ (I − T)² = Σ r_i² − 2 Σ r_i (I − T) = removal_i − o_i ∂L/∂o_i,
 //!
-//! because r_i is linear in the opacity o_i: two numbers that the renderer knows. A training camera *supports* a Gaussian that
-//! it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by held-out cameras, and
-//! all images together are better without it. That much holds for some Gaussians of every scene, whose images are never
-//! quite right, so that it must also matter to a camera. What removing the Gaussian gains there is −Δ; what removing as much as
-//! is best of what it shows would gain, were there more of it, is
+//! because r_i is linear in the opacity o_i: two numbers from the renderer. A training camera *supports* a Gaussian
+//! that it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by held-out
+//! cameras, and all images together are better without it. That much holds for some Gaussians of every scene, whose
+//! images are never quite right, so that it must also matter to a camera. What removing the Gaussian gains there is −Δ;
+//! the gain from removing the best amount of it, if there were more, is
 //!
 //! > max_a Σ (I − T)² − Σ (I − T − a r)² = (Σ r (I − T))² / Σ r² = (Σ r² − Δ)² / (4 Σ r²),
 //!
-//! which is large for all Gaussians of a veil, also those that others hide. The geometric mean of both, as a share of the squared
-//! error of the median camera, distinguishes veils from the rest.
+//! which is large for all Gaussians of a veil, also those that others hide. The geometric mean of both, as a share of
+//! the squared error of the median camera, distinguishes veils from the rest.
 
 use crate::capture::frames::{Frames, Picture};
 use splat4d::edit::Selected;
@@ -38,20 +38,20 @@ const SEEN: f64 = 0.005;
 const MISSED: f64 = 0.2;
 /// Largest share of the cameras that see a Gaussian which may support it, at strength 1.
 const SHARE: f64 = 0.5;
-/// Least share of the median camera's squared error that a floater matters to a camera, at strength 1; at others it is this by
-/// the strength. Measured on two captures with veils (docs/edit.md): at 0.01 more than 95 of 100 of the veil are found, and of the
-/// rest less than 3 in a thousand; at 0.005 four times as many of the rest.
+/// Least share of the median camera's squared error that a floater matters to a camera, at strength 1; at others it is
+/// this by the strength. Measured on two captures with veils (docs/edit.md): at 0.01 more than 95 of 100 of the veil
+/// are found, and of the rest less than 3 in a thousand; at 0.005 four times as many of the rest.
 const MATTERS: f64 = 0.005;
 
-/// What images say of one Gaussian.
+/// Evidence of the images about one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Support {
     /// Training cameras whose images it changes.
     pub seen: u32,
     /// Training cameras that would miss it.
     pub missed: u32,
-    /// How much it matters to the training camera that sees it to which it matters most, in squared error; zero where
-    /// no camera is better without it.
+    /// Its largest effect on any training camera that sees it, in squared error; zero where no camera is better without
+    /// it.
     pub matters: f64,
     /// Σ Δ over held-out images; below zero they are better without it.
     pub held: f64,
@@ -72,7 +72,7 @@ impl Support {
     }
 }
 
-/// What images say of a scene.
+/// Evidence of the images about a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Judged {
     /// By layer and Gaussian.
@@ -88,9 +88,8 @@ impl Judged {
     }
 }
 
-/// Of every Gaussian what the images say of it: those of `train`, which is a list of numbers of `frames`, and those
-/// that
-/// were held out. `told`: images done, and all.
+/// Of every Gaussian what the images show about it: those of `train`, which is a list of numbers of `frames`, and those
+/// that were held out. `told`: images done, and all.
 ///
 /// Errors: an image that cannot be read; no held-out images; a scene with a pixel head.
 pub fn support(

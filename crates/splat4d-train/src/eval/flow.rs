@@ -1,4 +1,4 @@
-//! End-point errors of drawn flow against the flow that a capture brings along (`flow` in capture.json), in pixels.
+//! End-point errors of rendered flow against the flow that a capture brings along (`flow` in capture.json), in pixels.
 
 use crate::Result;
 use crate::capture::Capture;
@@ -16,12 +16,12 @@ const MOVES: f32 = 0.5;
 /// End-point errors within which a pixel counts as right, pixels.
 pub(crate) const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 
-/// How well drawn flow agrees with known flow.
+/// How well rendered flow agrees with known flow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlowError {
     /// Images that were measured.
     pub pictures: usize,
-    /// Whether they were held out; else no held-out image knows its flow, and those of training stand in.
+    /// Whether they were held out; else no held-out image has flow, and training images are used.
     pub held: bool,
     /// Mean end-point error, pixels.
     pub mean: f64,
@@ -29,7 +29,7 @@ pub struct FlowError {
     pub median: f64,
     /// Mean end-point error of pixels that move by more than half a pixel; `None`: none does.
     pub moving: Option<f64>,
-    /// Mean length of their known flow: the error of saying that nothing moves.
+    /// Mean length of their known flow: the error of predicting no motion.
     pub length: Option<f64>,
     /// Share of all pixels within 1, 3 and 5 pixels.
     pub within: [f64; 3],
@@ -37,8 +37,7 @@ pub struct FlowError {
     pub drawn: f64,
 }
 
-/// Measures a scene on the held-out views that know their flow, or where there are none on those of training. `None`: none
-/// knows its flow.
+/// Measures a scene on the held-out views with known flow, or else on those of training. `None`: none has flow.
 ///
 /// Errors: a file of flow that cannot be read.
 pub fn flow_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<FlowError>> {
@@ -118,7 +117,7 @@ mod tests {
         Capture::open(folder, &CaptureOptions::default()).unwrap()
     }
 
-    /// The wall, which moves by so many pixels a frame.
+    /// The wall, which moves by this many pixels a frame.
     fn wall(pixels: f64) -> Scene<f32> {
         let mut p = Params::new(400, 1, &[]);
         let motion = build(&Spec::Spacetime(SpacetimeSpec { order: 1, ..SpacetimeSpec::default() }), &mut p).unwrap();

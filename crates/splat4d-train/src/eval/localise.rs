@@ -1,12 +1,11 @@
 //! Localisation: pose and time of an image in a fixed scene.
 //!
-//! The best of some starts, at some times, are found in small images. Each is then moved to where the scene
-//! differs least
-//! from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
-//! larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal
-//! length where
-//! it is asked for, so that derivatives are differences of renders. A gain and an offset of each colour are free, since another camera
-//! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
+//! The best of some starts, at some times, are found in small images. Each is then moved to where the scene differs
+//! least from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in
+//! larger and larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the
+//! focal length where it is requested, so that derivatives are differences of renders. A gain and an offset of each
+//! colour are free, since another camera has another exposure. What does not fit the scene much better than one plain
+//! colour would is refused ([`Located::is_sure`]).
 
 use crate::Result;
 use crate::train_state::moved;
@@ -47,16 +46,16 @@ const FOCAL: usize = 7;
 /// (docs/refine.md).
 pub const SURE: f64 = 1.0 / 3.0;
 
-/// What is asked.
+/// The query.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Question {
-    /// How the scene is drawn.
+pub struct Query {
+    /// How the scene is rendered.
     pub antialias: Antialias,
     /// Whether the focal length is searched for too.
     pub lens: bool,
 }
 
-/// Where an image was taken, as far as the scene determines it.
+/// Estimated pose and time of an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     /// From where, with the image's size.
@@ -92,7 +91,7 @@ struct Candidate {
     start: usize,
 }
 
-/// What all steps share.
+/// Data of all steps.
 struct Search<'a> {
     scene: &'a Scene<f32>,
     backend: Box<dyn Backend>,
@@ -105,20 +104,20 @@ struct Search<'a> {
 /// that were
 /// followed, and all.
 ///
-/// Errors: those of drawing. Panics: no starts; a start of another size than the image's.
+/// Errors: those of rendering. Panics: no starts; a start of another size than the image's.
 pub fn localise(
     scene: &Scene<f32>,
     picture: &Planes<f32>,
     starts: &[Camera],
-    question: Question,
+    query: Query,
     told: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
     assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
     assert!(starts.iter().all(fits), "starts have the image's size");
-    let backend = device::cpu(RenderConfig { antialias: question.antialias, ..RenderConfig::default() });
+    let backend = device::cpu(RenderConfig { antialias: query.antialias, ..RenderConfig::default() });
     let (instant, image) = (Evaluation::default(), Image::default());
-    let mut search = Search { scene, backend, instant, image, lens: question.lens };
+    let mut search = Search { scene, backend, instant, image, lens: query.lens };
     let mut candidates = search.tried(picture, starts)?;
     let (all, mut done) = (LEVELS.iter().map(|l| l.1).sum(), 0);
     let mut chance = 0.0;
@@ -163,7 +162,7 @@ impl Search<'_> {
         Ok(out)
     }
 
-    /// Draws what a candidate sees, in an image so many times smaller.
+    /// Renders a candidate's view, in an image reduced by this factor.
     fn draw(&mut self, candidate: &Candidate, times: usize, depth: bool) -> Result<&Image<f32>> {
         self.scene.at(Time(candidate.time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
@@ -177,7 +176,7 @@ impl Search<'_> {
         Ok(Compared::of(&self.draw(candidate, times, false)?.color, picture))
     }
 
-    /// Moves a candidate to where it sees what the image shows.
+    /// Moves a candidate to the pose that fits the image.
     fn follow(&mut self, candidate: &mut Candidate, picture: &Planes<f32>, times: usize) -> Result<()> {
         let sizes = self.sizes(candidate, times)?;
         let asked: Vec<usize> = (0..UNKNOWN).filter(|&k| sizes[k] > 0.0).collect();
@@ -217,7 +216,7 @@ impl Search<'_> {
         Ok(())
     }
 
-    /// How far each number goes for what is seen to move by [`DIFFERENCE`] pixels; 0: it is not searched for.
+    /// Change of each parameter that moves the image by [`DIFFERENCE`] pixels; 0: the parameter is fixed.
     fn sizes(&mut self, candidate: &Candidate, times: usize) -> Result<[f64; UNKNOWN]> {
         let drawn = self.draw(candidate, times, true)?;
         let solid = |(alpha, depth): (&f32, &f32)| (*alpha > SOLID).then(|| depth / alpha);
@@ -295,7 +294,8 @@ impl Compared {
         Self { residuals, gains, cost, difference }
     }
 
-    /// Of the weighted linear least squares in the unknowns: matrix [n, n] and right side. `slopes`: of the render, without gains.
+    /// Of the weighted linear least squares in the unknowns: matrix [n, n] and right side. `slopes`: of the render,
+    /// without gains.
     fn normal_equations(&self, slopes: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
         let n = slopes.len();
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
@@ -405,7 +405,7 @@ mod tests {
         let starts: Vec<Camera> = (0..6).map(|k| camera(f64::from(k), 0.3)).collect();
         let (truth, when) = (camera(2.12, 0.55), 0.37);
         let mut found =
-            localise(&scene, &drawn(&scene, &truth, when), &starts, Question::default(), &mut |_, _| {}).unwrap();
+            localise(&scene, &drawn(&scene, &truth, when), &starts, Query::default(), &mut |_, _| {}).unwrap();
         let off = |c: &Camera| {
             let apart: [f64; 3] = std::array::from_fn(|k| c.center()[k] - truth.center()[k]);
             apart.iter().map(|x| x * x).sum::<f64>().sqrt()
@@ -417,7 +417,7 @@ mod tests {
         for row in strange.data.chunks_mut(SIZE) {
             row.reverse();
         }
-        let lost = localise(&scene, &strange, &starts, Question::default(), &mut |_, _| {}).unwrap();
+        let lost = localise(&scene, &strange, &starts, Query::default(), &mut |_, _| {}).unwrap();
         assert!(!lost.is_sure(), "{lost:?}");
         (found.residual, found.chance) = (0.0, 0.0);
         assert!(!found.is_sure(), "a picture of one colour tells nothing");

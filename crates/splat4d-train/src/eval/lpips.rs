@@ -1,6 +1,6 @@
 //! LPIPS: the distance between two images in the features of a trained network.
 //!
-//! No weights come with this crate; a user names a file that holds, in 32-bit floats,
+//! This crate contains no weights; a user names a file that holds, in 32-bit floats,
 //!
 //! | name | shape |
 //! |---|---|
@@ -39,13 +39,13 @@ pub(crate) enum Net {
 /// How values in `[0,1]` enter the network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InputScaling {
-    /// Mapped to `[−1,1]` first, as the `lpips` package asks for.
+    /// Mapped to `[−1,1]` first, as the `lpips` package requires.
     Signed,
-    /// As they are, as the Inria 3DGS evaluation script does.
+    /// Unchanged, as the Inria 3DGS evaluation script does.
     Unit,
 }
 
-/// A layer: index in torchvision's `features`, slice of the `lpips` package, and what it does.
+/// A layer: index in torchvision's `features`, slice of the `lpips` package, and its operation.
 #[derive(Clone, Copy)]
 enum Layer {
     /// Index, slice, inputs, outputs, side, stride, pad; a ReLU follows.
@@ -103,7 +103,7 @@ const VGG: [Layer; 22] = [
 ];
 
 impl Net {
-    /// The key under which users know the result.
+    /// The usual name of the result.
     pub(crate) fn label(self) -> &'static str {
         match self {
             Net::Alex => "LPIPS-alex",

@@ -1,6 +1,6 @@
 //! Image metrics that need no learnt weights.
 //!
-//! Every metric sees values clamped to `[0,1]` and not rounded to 8 bits; a metric that is not defined for an image is
+//! Every metric uses values clamped to `[0,1]` and not rounded to 8 bits; a metric that is not defined for an image is
 //! `None`, never a synthetic number. All sums run in a fixed order in f64.
 
 use crate::loss::Photometric;
@@ -84,9 +84,9 @@ fn clamped(p: &Planes<f32>) -> Planes<f32> {
 
 /// Multi-scale SSIM: Π over five scales of contrast·structure^w, times luminance^w at the last; mean over channels.
 ///
-/// Windows lie wholly inside the image; between scales 2x2 pixels are averaged (an odd last row or column is dropped);
-/// a negative contrast·structure term counts as 0. `None` where the shorter side is below [`MS_SSIM_MIN_SIDE`].
-/// Source: Wang 2003.
+/// Windows are entirely inside the image; between scales 2x2 pixels are averaged (an odd last row or column is
+/// dropped); a negative contrast·structure term counts as 0. `None` where the shorter side is below
+/// [`MS_SSIM_MIN_SIDE`]. Source: Wang 2003.
 pub(crate) fn ms_ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> {
     assert_same(render, truth);
     if render.channels == 0 || render.height.min(render.width) < MS_SSIM_MIN_SIDE {
@@ -176,7 +176,7 @@ impl TemporalMean {
         self.frames += 1;
     }
 
-    /// Images so far.
+    /// Number of images.
     #[cfg(test)]
     pub(crate) fn frames(&self) -> usize {
         self.frames

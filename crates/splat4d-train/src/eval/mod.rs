@@ -1,4 +1,4 @@
-//! Measures renders and writes the scores in the files that 3DGS users know.
+//! Measures renders and writes the scores in the files of 3DGS.
 //!
 //! [`score_view`] measures one image, a [`Split`] holds the images of the held-out or the training cameras, and
 //! [`run::evaluate`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.
@@ -35,7 +35,7 @@ pub struct ViewContext<'a> {
     pub lpips: Option<(&'a Lpips, InputScaling)>,
 }
 
-/// All metrics of one view but `PSNR-cc`, which its camera's other views have a say in ([`run::assess`]).
+/// All metrics of one view but `PSNR-cc`, which depends on its camera's other views ([`run::assess`]).
 ///
 /// Keys: `PSNR`, `SSIM`, `MS-SSIM`, `D-SSIM`, `PSNR-dynamic`, with masks `PSNR-foreground`, with a network `LPIPS-alex`
 /// or `LPIPS-vgg` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: `[3,H,W]` both; the name is the

@@ -3,9 +3,8 @@
 //!
 //! In the world distances are compared with shares of the height of all points together, in images with pixels, as in
 //! TAP-Vid (Doersch et al. 2022) but for the images' own size, over the points that are truly seen. Where a capture
-//! brings
-//! `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the drawn visibility is compared
-//! with it; else every point in the image counts.
+//! brings `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the rendered
+//! visibility is compared with it; else every point in the image counts.
 
 use crate::capture::Capture;
 use crate::eval::tracks::Truth;
@@ -17,13 +16,13 @@ use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
 
-/// Which points each camera truly sees.
+/// True visibility of the points in each camera.
 pub const VISIBLE: &str = "truth/tracks_visible.npy";
 /// Pixels within which a point counts as found (TAP-Vid).
 pub(crate) const PIXELS: [f64; 5] = [1.0, 2.0, 4.0, 8.0, 16.0];
 /// Shares of the points' height within which a point counts as found in the world.
 pub(crate) const SHARES: [f64; 5] = [0.01, 0.02, 0.04, 0.08, 0.16];
-/// Cameras that look, at most: the held-out ones, or where there are none the first of training.
+/// Cameras, at most: the held-out ones, or where there are none the first of training.
 const CAMERAS: usize = 4;
 
 /// How well points are followed.
@@ -33,12 +32,12 @@ pub struct PointErrors {
     pub points: usize,
     /// Median distance over points and frames after the first, scene units (the median trajectory error).
     pub median: f64,
-    /// Share of all (point, later frame) within 1, 2, 4, 8 and 16 % of the points' height; what is lost is not.
+    /// Share of all (point, later frame) within 1, 2, 4, 8 and 16 % of the points' height; lost points are not.
     pub within: [f64; 5],
     /// Share of (point, later frame) at which nothing carries the point any more.
     pub lost: f64,
-    /// Slope of ln(root mean square distance) over ln(frames since the first): ½ a random walk, 1 a constant bias; `None`:
-    /// too few frames, or no error.
+    /// Slope of ln(root mean square distance) over ln(frames since the first): ½ a random walk, 1 a constant bias;
+    /// `None`: too few frames, or no error.
     pub slope: Option<f64>,
     /// The same in images.
     pub pictures: Option<PixelErrors>,
@@ -47,15 +46,15 @@ pub struct PointErrors {
 /// How well points are followed in images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelErrors {
-    /// Cameras that looked.
+    /// Cameras used.
     pub cameras: usize,
     /// Median distance of what is truly seen after the first frame, pixels.
     pub median: f64,
-    /// Share of it within 1, 2, 4, 8 and 16 pixels; what is lost is not.
+    /// Share of it within 1, 2, 4, 8 and 16 pixels; lost points are not.
     pub within: [f64; 5],
     /// Drift as in the world.
     pub slope: Option<f64>,
-    /// Share of (camera, point, later frame) whose visibility is right; `None`: the capture does not say it.
+    /// Share of (camera, point, later frame) whose visibility is right; `None`: the capture does not contain it.
     pub visibility: Option<f64>,
 }
 
@@ -91,7 +90,7 @@ pub fn point_errors(scene: &Scene<f32>, capture: &Capture) -> Result<Option<Poin
     }
     let mut pixels = Distances::new(PIXELS);
     let (mut right, mut asked) = (0usize, 0usize);
-    let cameras = lookers(capture);
+    let cameras = viewing_cameras(capture);
     for &(rig, camera) in &cameras {
         for k in 1..frames.len() {
             let seen = sights(scene, camera, Time(times[k]), &places(k));
@@ -122,8 +121,8 @@ pub fn point_errors(scene: &Scene<f32>, capture: &Capture) -> Result<Option<Poin
     Ok(Some(PointErrors { points: truth.points, median, within, lost, slope, pictures }))
 }
 
-/// Fixed cameras that look at the points, with their numbers: held out, or where there are none of training.
-fn lookers(capture: &Capture) -> Vec<(usize, &Camera)> {
+/// Fixed cameras for the comparison, with their numbers: held out, or else of training.
+fn viewing_cameras(capture: &Capture) -> Vec<(usize, &Camera)> {
     let of = |frames: &[usize]| {
         let mut out: Vec<(usize, &Camera)> = Vec::new();
         for frame in frames.iter().map(|&i| &capture.frames[i]).filter(|f| capture.cameras[f.camera].fixed) {
@@ -137,7 +136,7 @@ fn lookers(capture: &Capture) -> Vec<(usize, &Camera)> {
     if held.is_empty() { of(&capture.train) } else { held }
 }
 
-/// Who is truly seen.
+/// True visibility.
 struct Visible {
     frames: usize,
     points: usize,

@@ -4,7 +4,7 @@ use super::ColourMatrix;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-/// What the names of our own entries begin with, as 3DGS does; the steps follow.
+/// Prefix of our own entries, as 3DGS does; the steps follow.
 pub(super) const METHOD: &str = "ours_";
 
 /// A number, or why there is none.
@@ -163,16 +163,16 @@ fn add_notes(to: &mut Map<String, Value>, notes: Map<String, Value>) {
     }
 }
 
-/// What figures hold for, next to the steps of training: without it they do not compare.
+/// Conditions of the figures next to the training steps; only equal ones compare.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Conditions {
     /// `test`, `val` or `train`.
     pub split: &'static str,
-    /// What transparent pixels are composited on, sRGB from 0 to 1, in renders and truth; null: images have no alpha.
+    /// Background of transparent pixels, sRGB from 0 to 1, in renders and truth; null: images have no alpha.
     pub background: Option<[f32; 3]>,
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,
-    /// What drew.
+    /// The renderer.
     pub device: String,
 }
 
@@ -181,9 +181,9 @@ pub struct Conditions {
 pub struct Report {
     /// Steps of training; the method is called `ours_{iteration}`, as 3DGS does.
     pub iteration: u64,
-    /// What the figures hold for.
+    /// Conditions of the figures.
     pub conditions: Conditions,
-    /// The views that were asked for: those held out, by default.
+    /// The views that were requested: those held out, by default.
     pub test: Split,
     /// Training cameras, written apart under `train`; `None` where they were not evaluated.
     pub train: Option<Split>,
@@ -195,9 +195,11 @@ impl Report {
         format!("{METHOD}{}", self.iteration)
     }
 
-    /// `results.json`: `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
+    /// `results.json`:
+    /// `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
     ///
-    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that is not defined is null, and `notes` states why.
+    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that
+    /// is not defined is null, and `notes` states why.
     pub fn results(&self) -> Value {
         self.nested(Split::results_json)
     }
@@ -252,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn results_have_the_keys_that_3dgs_users_know() {
+    fn results_have_the_keys_of_3dgs() {
         let results = report().results();
         let ours = &results["ours_7000"];
         let number = |v: &Value| v.as_f64().expect("a number");

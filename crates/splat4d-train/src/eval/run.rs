@@ -1,5 +1,5 @@
-//! Evaluation of a scene on a capture: every held-out view is drawn and compared with its image, a few training views
-//! too; scores, images and a summary are written as 3DGS users know them.
+//! Evaluation of a scene on a capture: every held-out view is rendered and compared with its image, a few training
+//! views too; scores, images and a summary are written in the files of 3DGS.
 //!
 //! | file | content |
 //! |---|---|
@@ -45,7 +45,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const TRAIN_VIEWS: usize = 24;
 /// A mean difference of the channels as large as this is the last colour of an error image.
 const ERROR_FULL: f32 = 0.25;
-/// What draws: figures are the CPU renderer's, which defines what others draw.
+/// The renderer: figures are the CPU renderer's, which defines the result of the others.
 const DEVICE: &str = "CPU";
 /// Mask values above this are foreground.
 const FOREGROUND: f32 = 0.5;
@@ -97,12 +97,12 @@ pub struct EvalOptions {
     pub train_views: usize,
     /// The views that are measured.
     pub measured: Measured,
-    /// Where results and images go in their files: `None` for the held-out views on the run's own background, which are
-    /// what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
+    /// Prefix of results and images in their files: `None` for the held-out views on the run's own background, which
+    /// are what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
-    /// What draws; the metrics are the CPU's.
+    /// The renderer; the metrics are the CPU's.
     pub device: Device,
 }
 
@@ -166,10 +166,10 @@ enum Views<'a> {
     Train,
 }
 
-/// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
+/// Renders and measures the held-out views of `capture` (and a few training views), and writes the files above.
 ///
-/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written; `stop` was raised, which is
-/// checked before each view.
+/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written; `stop` was raised,
+/// which is checked before each view.
 pub fn evaluate(
     scene: &Scene<f32>,
     capture: &Capture,
@@ -199,7 +199,7 @@ pub fn evaluate(
     Ok(evaluation)
 }
 
-/// The same without the two JSON files; images only if the options ask for them.
+/// The same without the two JSON files; images only if the options request them.
 ///
 /// Errors: those of [`evaluate`].
 pub fn assess(
@@ -224,7 +224,7 @@ pub fn assess(
     let mut test = judge.split(options.measured.frames(capture), whole, name, listen)?;
     let dynamic_share = judge.dynamic_share();
     let frames = options.measured.frames(capture);
-    // What was trained on stands where training put it.
+    // Training views keep the poses of training.
     let align = options.align.as_ref().filter(|_| options.measured != Measured::Train && !frames.is_empty());
     let aligned = align.map(|align| judge.align(align, frames, &mut test, listen)).transpose()?;
     let some =
@@ -317,7 +317,7 @@ impl<'a> Judge<'a> {
             for &place in &camera.places {
                 if self.stop.load(Ordering::SeqCst) {
                     return Err(Error::new(ErrorKind::Interrupted, "evaluation was stopped")
-                        .remedy("The same command begins it again."));
+                        .remedy("Run the same command again."));
                 }
                 let Drawn { view, image, truth, sums } = self.view(&file_name(place), frames[place], mean.as_ref())?;
                 colours.push(sums);
@@ -326,7 +326,7 @@ impl<'a> Judge<'a> {
                 }
                 views[place] = Some(view);
                 if let Views::Whole(Some(folder)) = kind {
-                    write_pictures(folder, place, &image, &truth)?;
+                    write_images(folder, place, &image, &truth)?;
                 }
                 done += 1;
                 listen(&Event::Phase { name: name.into(), done, total: frames.len() });
@@ -344,7 +344,8 @@ impl<'a> Judge<'a> {
         Ok(split)
     }
 
-    /// Measures `PSNR-aligned` and `PSNR-dynamic-aligned` of frames that `split` holds. Returns how far they were moved.
+    /// Measures `PSNR-aligned` and `PSNR-dynamic-aligned` of frames that `split` holds. Returns how far they were
+    /// moved.
     fn align(
         &mut self,
         align: &Align,
@@ -380,7 +381,8 @@ impl<'a> Judge<'a> {
         Ok(mean.mean().expect("a camera has at least one frame"))
     }
 
-    /// Draws a frame from where `capture` has it: the render, clean of pixels without truth, the truth, and the sums of both.
+    /// Renders a frame from where `capture` has it: the render, clean of pixels without truth, the truth, and the sums
+    /// of both.
     fn draw(&mut self, capture: &Capture, frame: usize) -> Result<(Planes<f32>, Planes<f32>, ColourSums)> {
         let stored = self.store.load(frame)?;
         let (info, mut truth) = (&capture.frames[frame], Planes::default());
@@ -398,7 +400,7 @@ impl<'a> Judge<'a> {
         Ok((image, truth, sums))
     }
 
-    /// Draws one frame and measures it.
+    /// Renders one frame and measures it.
     fn view(&mut self, name: &str, frame: usize, mean: Option<&Planes<f32>>) -> Result<Drawn> {
         let (image, truth, sums) = self.draw(self.capture, frame)?;
         let stored = self.store.load(frame)?;
@@ -417,7 +419,7 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// A frame that was drawn and measured.
+/// A frame that was rendered and measured.
 struct Drawn {
     view: View,
     /// The render, clean of pixels without truth.
@@ -427,7 +429,7 @@ struct Drawn {
     sums: ColourSums,
 }
 
-/// Fits a camera's colours over all its views (`sums`, one a place), and sets `PSNR-cc` of each of them.
+/// Fits a camera's colours over all its views (`sums`, one a position), and sets `PSNR-cc` of each of them.
 fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mut [Option<View>]) -> CameraScores {
     let mut all = ColourSums::default();
     sums.iter().for_each(|view| all.add(view));
@@ -440,7 +442,7 @@ fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mu
     CameraScores { name: name.into(), places: places.to_vec(), colour }
 }
 
-/// A camera and the places of its frames in a list, in time.
+/// A camera and the positions of its frames in a list, in time.
 struct CameraFrames {
     id: usize,
     places: Vec<usize>,
@@ -498,7 +500,7 @@ fn file_name(place: usize) -> String {
     format!("{place:05}.png")
 }
 
-fn write_pictures(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
+fn write_images(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
     let error = metrics::error_map(render, truth, ERROR_FULL);
     let all = [("renders", render), ("gt", truth), ("errors", &error)];
     all.into_par_iter()

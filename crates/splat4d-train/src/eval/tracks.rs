@@ -1,11 +1,10 @@
-//! 3D error of tracks against known ones: captures that were drawn come with the true paths of points of their surfaces.
+//! 3D error of tracks against known ones: rendered captures contain the true paths of points of their surfaces.
 //!
-//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a question, as
-//! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and the
-//! error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
-//! itself, its
-//! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which none of a
-//! point's Gaussians is alive are not counted, but the share that is counted is reported.
+//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a query, as
+//! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and
+//! the error is its distance to the truth at all later frames. The error of the nearest Gaussian is reported next to it
+//! itself, its distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which
+//! none of a point's Gaussians is alive are not counted, but the share that is counted is reported.
 
 use crate::capture::Capture;
 use crate::{Error, Result};
@@ -16,7 +15,7 @@ use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
 
-/// Where a capture keeps the truth.
+/// Path of the truth in a capture.
 pub const FILE: &str = "truth/tracks.npy";
 /// Gaussians that carry a point: one alone may be a floater.
 const CARRIERS: usize = 4;
@@ -68,7 +67,7 @@ pub(super) struct Truth {
 }
 
 impl Truth {
-    /// What a capture brings along; `None`: nothing.
+    /// True tracks of a capture; `None`: nothing.
     pub(super) fn of(capture: &Capture) -> Result<Option<Self>> {
         let path = capture.root.join(FILE);
         if !path.is_file() {
@@ -162,7 +161,7 @@ mod tests {
     fn points_are_carried_by_the_gaussians_that_were_nearest_at_first() {
         let mut params = Params::new(3, 1, &[]);
         let times = vec![0.0, 0.1, 0.2];
-        // The last one is faint and stands in the way.
+        // The last one is faint and occludes.
         for (r, o) in [(0, 3.0), (1, 3.0), (2, -3.0)] {
             params[GEOMETRY].write(r, 0, [r as f32, 0.0, 0.0, 1.0]);
             params[GEOMETRY].set(r, OPACITY, o);

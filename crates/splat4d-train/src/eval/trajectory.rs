@@ -1,4 +1,4 @@
-//! Where cameras were found, against where they are known to be: absolute and relative trajectory error, and clocks.
+//! Estimated against known camera poses: absolute and relative trajectory error, and clocks.
 
 use super::run::merge;
 use crate::capture::Capture;
@@ -9,7 +9,7 @@ use splat4d::math::{Se3, Sim3};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// Fewest cameras that say more than the similarity that is taken away.
+/// Fewest cameras that determine more than the similarity that is taken away.
 const FEWEST: usize = 3;
 
 /// How far the cameras of a capture are from their truth.
@@ -49,11 +49,11 @@ impl TrajectoryError {
     }
 }
 
-/// Compares the training cameras of a capture, as they were found, with those of the same names in another, which knows.
-/// Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are images of
-/// one moving camera, and fixed cameras in the capture's order.
+/// Compares the training cameras of a capture, as they were found, with those of the same names in another, which
+/// contains. Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are
+/// images of one moving camera, and fixed cameras in the capture's order.
 ///
-/// Errors: fewer than three cameras have a truth, or stand in different places.
+/// Errors: fewer than three cameras have a ground truth, or differ in position.
 pub fn trajectory_error(found: &Capture, truth: &Capture) -> Result<TrajectoryError> {
     let mut known: BTreeMap<(&str, usize), usize> = BTreeMap::new();
     for (i, frame) in truth.frames.iter().enumerate() {

@@ -1,6 +1,7 @@
 //! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
-//! sees what is farther away belongs to something that moves: it lives about its time, and begins with the velocity
-//! that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others are static.
+//! sees what is farther away belongs to something that moves: its lifespan is around its time, and it begins with the
+//! velocity that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others are
+//! static.
 
 use super::map::Map;
 use super::{Seeds, scene_flow};
@@ -12,12 +13,13 @@ use std::f64::consts::TAU;
 
 /// Images that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Points a wanted one that are static.
+/// Points per requested one that are static.
 const CANDIDATES: usize = 4;
-/// Pixels of an image of which is asked whether they move, at most.
+/// Pixels of an image that are tested for motion, at most.
 const ASKED: usize = 20_000;
-/// As a share of the wanted points, those on dynamic regions that are alive at a time: lives are as wide as that takes,
-/// within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities change.
+/// As a share of the requested points, those on dynamic regions that are alive at a time: lifespans are as wide as that
+/// takes, within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities
+/// change.
 const ALIVE_SHARE: f64 = 0.15;
 const LIFE: [f64; 2] = [0.5, 2.0];
 
@@ -27,13 +29,13 @@ struct Candidate {
     pixel: usize,
     point: [f64; 3],
     color: [f32; 3],
-    /// Whether it may stand for what is still.
+    /// Whether it may represent what is still.
     still: bool,
 }
 
-/// About `count` points of metric depth maps that are static; none where there are no such maps. With `moving`, up to as
-/// many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that is
-/// examined.
+/// About `count` points of metric depth maps that are static; none where there are no such maps. With `moving`, up to
+/// as many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that
+/// is examined.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
     let chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
@@ -74,7 +76,7 @@ pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) 
     times.dedup();
     if let [first, .., last] = times[..] {
         let gap = (last - first) / (times.len() - 1) as f64;
-        // The integral of a life exp(−½(t/w)²) is √(2π)w.
+        // The integral of a lifespan exp(−½(t/w)²) is √(2π)w.
         let wanted = ALIVE_SHARE * count as f64 / alive.len().max(1) as f64 * (last - first) / TAU.sqrt();
         out.life = Some(wanted.clamp(LIFE[0] * gap, LIFE[1] * gap));
     }
@@ -177,10 +179,10 @@ mod tests {
         assert!(life >= 0.5 * gap && life <= 2.0 * gap, "{life}");
         let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
-        // Gaussians that live through the whole clip begin with what moves at one time of it.
+        // Gaussians that are alive during the whole clip begin with the moving points of one time.
         let recipe = Recipe::default().with(|r| r.init.count = 400);
         let plan = TrainContext { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
-        let one = super::super::one_moment(&plan, &recipe.init, &deep, None).unwrap();
+        let one = super::super::one_time(&plan, &recipe.init, &deep, None).unwrap();
         let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
         let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;
         let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();

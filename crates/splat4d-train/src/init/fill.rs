@@ -1,4 +1,4 @@
-//! Points between the points: where a capture brings few, every camera sees surfaces that go on from one to the next.
+//! Points between the points: if a capture has few, every camera sees surfaces that continue from one to the next.
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls
 //! settle wherever the training cameras cannot see them, as haze in front of views that were not trained on. Here every
@@ -25,7 +25,7 @@ const RIDGE: f64 = 0.05;
 const BORDER: f64 = 0.15;
 /// Views that are covered, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Foreground in the masks moves: other points stand for it.
+/// Foreground in the masks moves: other points represent it.
 const FOREGROUND: f32 = 0.5;
 
 /// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them.
@@ -69,7 +69,7 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> 
     Ok(out)
 }
 
-/// One image of every fixed camera, and of every place of moving ones.
+/// One image of every fixed camera, and of every position of moving ones.
 fn views(frames: &dyn Frames) -> Vec<usize> {
     let mut places = HashSet::new();
     let new = |&i: &usize| {

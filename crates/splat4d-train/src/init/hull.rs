@@ -11,32 +11,32 @@ use splat4d::math::{Rng, median_by};
 use splat4d::scene::Camera;
 use std::collections::BTreeMap;
 
-/// Candidates a wanted point: the hull is a small part of the box.
+/// Candidates per requested point: the hull is a small part of the box.
 const CANDIDATES: usize = 40;
 /// Rounds of narrowing the box.
 const ROUNDS: u64 = 4;
 /// The next round's box is this much larger on every side than what was kept.
 const MARGIN: f64 = 0.05;
-/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes where
-/// it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
+/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and moving objects have
+/// holes where they resemble the background (0.25 gave more ghosts: 0.3 dB less in static regions).
 const MISSES: f64 = 0.05;
 const MOVING_MISSES: f64 = 0.15;
-/// Points of dynamic regions, of those that are asked for: all of them took Gaussians away from the static background
-/// (0.4 dB less there, as good where things move).
+/// Points of dynamic regions, of those that are requested: all of them took Gaussians away from the static background
+/// (0.4 dB less there, no gain in dynamic ones).
 const MOVING_SHARE: f64 = 0.3;
-/// What moves is grown by so many pixels, since it hides the edges of what is behind it.
+/// Moving regions are dilated by this many pixels, because they hide the edges behind them.
 const GROWN: usize = 1;
 /// Cameras that must see something move for its hull to be more than a cone: of four the hull was worse than nothing.
 const MOVING_CAMERAS: usize = 5;
 /// A camera in which more of the image differs (an exposure that was changed, a camera that was pushed) shows no
 /// silhouette.
 const MOVING_PICTURE: f64 = 0.5;
-/// A point must be seen by at least so many images.
+/// A point must be seen by at least this many images.
 const MIN_VIEWS: usize = 2;
-/// One moving camera: images of so many times around stand in for other cameras.
+/// One moving camera: images of this many times around replace other cameras.
 const MONOCULAR_PICTURES: usize = 60;
 
-/// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
+/// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time represent all.
 pub(crate) fn carve(
     frames: &dyn Frames,
     volume: &Volume,
@@ -47,10 +47,10 @@ pub(crate) fn carve(
 ) -> Result<Seeds> {
     let each = count.div_ceil(times.len().max(1));
     let mut out = Seeds::default();
-    // A single camera sees one side at a time: all times together carve one hull, good for every time.
-    let monocular = pictures_near(frames, times[0]).1.len() < MIN_VIEWS;
+    // A single camera sees one side at a time: all times together carve one hull for every time.
+    let monocular = images_near(frames, times[0]).1.len() < MIN_VIEWS;
     for (k, &t) in times.iter().enumerate() {
-        let (near, mut pictures) = pictures_near(frames, t);
+        let (near, mut pictures) = images_near(frames, t);
         let stamp = (moving && !monocular).then_some(near);
         if monocular {
             pictures = spread(frames);
@@ -67,7 +67,7 @@ pub(crate) fn carve(
             Ok(())
         };
         let silhouettes = Silhouettes { count: pictures.len(), misses: MISSES, shown: &shown };
-        let mut kept = carve_moment(&silhouettes, volume, wanted, rng.fork(k as u64))?;
+        let mut kept = carve_time(&silhouettes, volume, wanted, rng.fork(k as u64))?;
         kept.times.fill(stamp);
         out.append(kept);
         if monocular {
@@ -77,9 +77,9 @@ pub(crate) fn carve(
     Ok(out)
 }
 
-/// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is nearest
-/// to it, if that is less than half a frame.
-pub(super) fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
+/// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is
+/// nearest to it, if that is less than half a frame.
+pub(super) fn images_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
     let all = || (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0));
     let Some(best) = all().map(|(_, time)| time).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs())) else {
         return (t, Vec::new());
@@ -138,7 +138,7 @@ pub(crate) fn carve_moving(
             Ok(())
         };
         let silhouettes = Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown };
-        let mut kept = carve_moment(&silhouettes, volume, each, rng.fork(k as u64))?;
+        let mut kept = carve_time(&silhouettes, volume, each, rng.fork(k as u64))?;
         kept.times.fill(Some(t));
         out.append(kept);
     }
@@ -153,7 +153,7 @@ fn grown(mask: &[bool], width: usize) -> Vec<bool> {
     (0..mask.len()).map(any).collect()
 }
 
-/// What one camera shows at a time, by pixels.
+/// One camera's silhouette at a time, by pixels.
 struct Silhouette<'a> {
     camera: &'a Camera,
     inside: &'a (dyn Fn(usize) -> bool + Sync),
@@ -171,9 +171,9 @@ struct Silhouettes<'a> {
     shown: &'a Shown<'a>,
 }
 
-/// Carves one time in rounds: each looks only in the box of what the last one kept, so that a small object in a large
-/// volume still gets its points.
-fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
+/// Carves one time in rounds: each searches only the box of the points that the last one kept, so that a small object
+/// in a large volume still gets its points.
+fn carve_time(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);
     let mut high = volume.center.map(|c| c + volume.radius);
     let mut out = Seeds::default();
@@ -204,7 +204,7 @@ fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, r
     Ok(out)
 }
 
-/// The images' votes so far on one point.
+/// The images' votes on one point.
 #[derive(Clone, Default)]
 struct Votes {
     views: usize,

@@ -5,8 +5,8 @@ use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::{Camera, Planes};
 
-/// An image sees through a point if what it shows there is farther away by more than this share: beyond the noise of
-/// sensors and the slant of surfaces within a pixel.
+/// An image sees through a point if its depth there is larger by more than this share: beyond the noise of sensors and
+/// the slant of surfaces within a pixel.
 const THROUGH: f64 = 0.05;
 /// Images whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
 /// seeds, and a hundred maps of that size fit into any memory.
@@ -37,7 +37,7 @@ impl Map {
         Ok(Some(Self { frame, camera, time: frames.time(frame).0, depth }))
     }
 
-    /// Whether it sees something farther away where the point is.
+    /// Whether it sees a larger depth at the point.
     pub(super) fn sees_through(&self, point: [f64; 3]) -> bool {
         let Some(([u, v], z)) = self.camera.project(point) else { return false };
         let (w, h) = (self.depth.width as f64, self.depth.height as f64);

@@ -31,14 +31,14 @@ pub struct Seeds {
     pub colors: Vec<[f32; 3]>,
     /// When the point was seen, seconds; `None`: during the whole clip.
     pub times: Vec<Option<f64>>,
-    /// How fast it moves, scene units a second; zero where unknown.
+    /// How fast it moves, scene units per second; zero where unknown.
     pub velocities: Vec<[f64; 3]>,
-    /// Width of the lives of points with a time, seconds; `None`: the recipe's.
+    /// Width of the lifespans of points with a time, seconds; `None`: the recipe's.
     pub life: Option<f64>,
 }
 
 impl Seeds {
-    /// Points of a cloud, which says nothing of velocities.
+    /// Points of a cloud, which carries no information of velocities.
     pub(crate) fn of(cloud: &PointCloud) -> Self {
         let velocities = vec![[0.0; 3]; cloud.points.len()];
         let (points, colors, times) = (cloud.points.clone(), cloud.colors.clone(), cloud.times.clone());
@@ -82,7 +82,7 @@ impl Seeds {
         self.retain(|i, _| keep[i]);
     }
 
-    /// Keeps those of which the rule says so.
+    /// Keeps those that the rule selects.
     fn retain(&mut self, rule: impl Fn(usize, &Self) -> bool) {
         let old = std::mem::take(self);
         self.life = old.life;
@@ -99,9 +99,9 @@ settings! {
         /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
         /// file.
         source: Source = Source::Auto;
-        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000 Gaussians. If
-        /// a capture has fewer points, more are placed between them along surfaces; hulls of masks and of dynamic regions,
-        /// and random points, add as many.
+        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000
+        /// Gaussians. If a capture has fewer points, more are placed between them along surfaces; hulls of masks and of
+        /// dynamic regions, and random points, add as many.
         count: usize = 0 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
@@ -114,17 +114,17 @@ settings! {
     }
 }
 
-/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static scene
-/// of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the same steps, at an
-/// eighth more time (studies/records/2026-11-27-real-size.md).
+/// Initial Gaussians where [`InitSettings::count`] is 0: the number that small captures are tuned for (docs/suite.md).
+/// A static scene of many Gaussians starts with a third of them: a real room at half size gains 0.3 dB by half of them
+/// in the same steps, at an eighth more time (studies/records/2026-11-27-real-size.md).
 pub(crate) const COUNT: usize = 10_000;
 
-/// Where the first Gaussians are.
+/// Source of the first Gaussians.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what cameras
-    /// see, those that its images show, and more between them; the hull of masks, or of dynamic regions before fixed
-    /// cameras; else at random.
+    /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what
+    /// cameras see, those that its images show, and more between them; the hull of masks, or of dynamic regions before
+    /// fixed cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
@@ -171,12 +171,13 @@ impl Value for Source {
 
 /// A random colour would have to be unlearnt; grey is the least wrong.
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
-/// A life this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
+/// A lifespan this many clips wide is practically infinite: at the clip's ends σ is still above 0.96.
 const LONG_LIFE_CLIPS: f64 = 2.0;
-/// One keyframe of initial points about every so many frames.
+/// One keyframe of initial points about every n frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
-/// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a lone point
-/// would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow first.
+/// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a
+/// lone point would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow
+/// first.
 const LARGEST_SCALE: f64 = 0.05;
 /// Smallest initial scale, of the extent.
 const SMALLEST_SCALE: f64 = 1e-5;
@@ -244,7 +245,7 @@ pub fn seeds(
         }
     }
     if have_depth {
-        // What a map shows no hull knows better.
+        // Depth maps are more accurate than hulls.
     } else if use_hull {
         out.append(hull::carve(frames, &volume, &times, count, moving, rng.fork(1))?);
     } else if settings.source == Source::Auto && have_points && moving {
@@ -256,9 +257,9 @@ pub fn seeds(
     Ok(out)
 }
 
-/// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
-/// nearest to where it will be.
-pub(crate) fn one_moment(
+/// Initial points for Gaussians that are alive during the whole clip: those of its middle, where moving objects are on
+/// average nearest to where it will be.
+pub(crate) fn one_time(
     plan: &TrainContext,
     settings: &InitSettings,
     frames: &dyn Frames,
@@ -267,7 +268,7 @@ pub(crate) fn one_moment(
     let single = InitSettings { keyframes: settings.keyframes.max(1), ..settings.clone() };
     let mut out = seeds(plan, &single, frames, points, true)?;
     if out.life.take().is_some() {
-        // Depth maps show every time: of dynamic regions only one is wanted.
+        // Depth maps show every time: of dynamic regions only one is needed.
         let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
         let nearest =
             out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
@@ -322,7 +323,7 @@ pub fn scene(
     Ok(Scene { layers, background, clip, fps, up, head, ..Scene::default() })
 }
 
-/// Centre and width (seconds) of the life that a Gaussian at a seed starts with.
+/// Centre and width (seconds) of the lifespan that a Gaussian at a seed starts with.
 fn first_life(plan: &TrainContext, settings: &InitSettings, seeds: &Seeds, i: usize) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan, settings).len() as f64;
     let short = match seeds.life {
@@ -365,7 +366,7 @@ mod tests {
     use splat4d::layers::Evaluation;
     use splat4d::scene::{Rows, Space, Time};
 
-    /// What is far is as wide as its neighbours are apart, as seen from the cameras, and not a speck.
+    /// Far Gaussians are as wide as the distance to their neighbours, seen from the cameras.
     #[test]
     fn first_sizes_are_bounded_by_the_distance_from_the_cameras() {
         let plan = TrainContext { extent: 2.0, center: [0.0, 0.0, -1.0], ..TrainContext::default() };

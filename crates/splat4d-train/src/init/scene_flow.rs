@@ -10,9 +10,10 @@ use splat4d::flow::lift::lift;
 use splat4d::math::median;
 use splat4d::scene::Planes;
 
-/// The four pixels about a place show one surface where their depths differ by less than this share.
+/// The four pixels about a position show one surface where their depths differ by less than this share.
 const ONE_SURFACE: f64 = 0.05;
-/// A velocity is the median, axis by axis, of so many known ones nearest to it: flow errs where patches straddle an edge.
+/// A velocity is the median, axis by axis, of this many known ones nearest to it: flow errs where patches straddle an
+/// edge.
 const NEAREST: usize = 9;
 
 /// Velocities of pixels of an image, scene units a second, axes of the world; zero where no neighbour of the image
@@ -67,7 +68,7 @@ fn neighbours(frames: &dyn Frames, frame: usize) -> [Option<usize>; 2] {
     [before, after]
 }
 
-/// Where a pixel's point goes by the other map's time; nothing where flow or depth there is not known.
+/// Position of a pixel's point at the other map's time; none where flow or depth there is not known.
 fn displacement(from: &Map, to: &Map, flow: &Planes<f32>, pixel: usize) -> Option<[f64; 3]> {
     let (n, w) = (flow.pixels(), flow.width);
     if flow.data[2 * n + pixel] <= 0.0 {
@@ -136,7 +137,7 @@ mod tests {
             Self { cameras: (0..3).map(camera).collect(), blobs: (0..160).map(blob).collect(), brings }
         }
 
-        /// Where a pixel's ray meets the wall in frame i.
+        /// Intersection of a pixel's ray with the wall in frame i.
         fn hit(&self, i: usize, x: usize, y: usize) -> ([f64; 3], f64) {
             let (camera, at) = (&self.cameras[i], [x as f64 + 0.5, y as f64 + 0.5]);
             let z = VELOCITY[2] * FRAME * i as f64;

@@ -7,7 +7,7 @@ use splat4d::math::mat3::solve;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Camera;
 
-/// Where the cameras look.
+/// The cameras' target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Volume {
     /// The point nearest to all optical axes.
@@ -16,7 +16,7 @@ pub(crate) struct Volume {
     pub radius: f64,
 }
 
-/// The box reaches this share of the way from its centre to the nearest camera's: 3 m of a rig of radius 4 m.
+/// The box reaches this share of the distance from its centre to the nearest camera's: 3 m of a rig of radius 4 m.
 const REACH: f64 = 0.75;
 
 /// The least-squares meeting point of the optical axes, and a box around it that stops short of the cameras.
@@ -50,15 +50,15 @@ pub(crate) fn common(frames: &dyn Frames) -> Volume {
     Volume { center, radius }
 }
 
-/// Cameras that are asked whether they see a candidate.
+/// Cameras that are tested for a candidate's visibility.
 const ASKED: usize = 100;
-/// A random point must be seen by this share of the cameras that see the best seen one: what only few see is hardly
+/// A random point must be seen by this share of the cameras that see the best seen one: a point that few see is hardly
 /// learnt, and hangs as haze in front of views that were not trained on.
 const SEEN_SHARE: f64 = 0.25;
-/// Candidates a wanted point, at most.
+/// Candidates per requested point, at most.
 const CANDIDATES: usize = 32;
 
-/// Uniform points of the box where cameras look; with `clip`, each at a random time of it. Fewer than `count` if
+/// Uniform points of the box that the cameras see; with `clip`, each at a random time of it. Fewer than `count` if
 /// cameras see hardly any of the box.
 pub(crate) fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
     let asked = frames.len().min(ASKED);

@@ -1,4 +1,4 @@
-//! Features: places that look alike from other cameras, and what they look like (Lowe 2004, SIFT).
+//! Features: image positions that can be recognised from other cameras, and their descriptors (Lowe 2004, SIFT).
 //!
 //! Extrema of differences of Gaussians over place and scale, refined below the pixel; histograms of gradients around
 //! them, turned by the main gradient. Square roots of histograms are compared (Arandjelović and Zisserman 2012), as
@@ -21,7 +21,7 @@ pub struct Feature {
     pub pixel: [f64; 2],
     /// How much it differs from what is around it.
     pub contrast: f32,
-    /// What it looks like.
+    /// Its descriptor.
     pub descriptor: [u8; NUMBERS],
 }
 
@@ -39,8 +39,8 @@ const INTERVALS: usize = 3;
 const SIGMA: f64 = 1.6;
 /// Blur of a camera's image before anything is done to it, pixels (Lowe 2004).
 const CAMERA_BLUR: f64 = 0.5;
-/// Least contrast of an extremum where nothing else is said; Lowe's 0.04 / [`INTERVALS`], halved for images that are
-/// dark.
+/// Least contrast of an extremum where nothing else is reported; Lowe's 0.04 / [`INTERVALS`], halved for images that
+/// are dark.
 const CONTRAST: f64 = 0.02 / INTERVALS as f64;
 /// An extremum along an edge has one curvature this many times the other (Lowe 2004).
 const EDGE: f64 = 10.0;
@@ -52,7 +52,7 @@ const BORDER: usize = 5;
 const MOVES: usize = 5;
 /// Images of fewer pixels are doubled first: their finest detail makes the best features (Lowe 2004).
 const DOUBLED_BELOW: usize = 500_000;
-/// Features of an image where nothing else is said, at most: those of highest contrast.
+/// Features of an image where nothing else is reported, at most: those of highest contrast.
 const MOST: usize = 3000;
 
 /// How many features are searched for.
@@ -60,7 +60,7 @@ const MOST: usize = 3000;
 pub struct Limits {
     /// Least contrast of an extremum, of an image in [0, 1].
     pub contrast: f64,
-    /// At most so many, those of highest contrast.
+    /// At most this many, those of highest contrast.
     pub most: usize,
 }
 
@@ -234,7 +234,8 @@ impl Octave {
         })
     }
 
-    /// The main directions of the gradients around a point: the highest peak of their histogram, and one nearly as high.
+    /// The main directions of the gradients around a point: the highest peak of their histogram, and one nearly as
+    /// high.
     fn angles(&self, point: &Point) -> Vec<f64> {
         /// Bins of the histogram, spread of the weights over the point's own σ, and what is nearly as high (Lowe 2004).
         const BINS: usize = 36;

@@ -34,7 +34,7 @@ pub(crate) fn every_second(from: &Planes<f32>) -> Planes<f32> {
     out
 }
 
-/// The value at pixel position (u, v), linearly between pixel centres; the border goes on outside.
+/// The value at pixel position (u, v), linearly between pixel centres; the border continues outside.
 pub fn sample(from: &Planes<f32>, u: f32, v: f32) -> f32 {
     let x = (u - 0.5).clamp(0.0, from.width as f32 - 1.0);
     let y = (v - 0.5).clamp(0.0, from.height as f32 - 1.0);
@@ -47,7 +47,7 @@ pub fn sample(from: &Planes<f32>, u: f32, v: f32) -> f32 {
     upper + fy * (lower - upper)
 }
 
-/// Blurred by a Gaussian, rows then columns; the border goes on outside.
+/// Blurred by a Gaussian, rows then columns; the border continues outside.
 pub fn blurred(from: &Planes<f32>, sigma: f64) -> Planes<f32> {
     /// Of σ: what is beyond weighs a thousandth.
     const REACH: f64 = 3.5;

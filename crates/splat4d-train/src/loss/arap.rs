@@ -1,7 +1,7 @@
 //! As rigid as possible, and smooth in time: losses on positions alone, for control nodes and for any model.
 //!
-//! Every function adds `weight` times its gradient and returns `weight` times its value; the same bits with any number of
-//! threads.
+//! Every function adds `weight` times its gradient and returns `weight` times its value; the same bits with any number
+//! of threads.
 
 use super::graph::{Graph, add_to, length, over_points, square, sub, turn, turn_back};
 use rayon::prelude::*;
@@ -100,7 +100,7 @@ pub(crate) fn elastic<F: Real>(
     let factor = F::of(2.0 * scale / (graph.edges() * times) as f64);
     for (t, d) in d.iter_mut().enumerate() {
         over_points(d, |i, d| {
-            // The same for an edge from either end: its length knows no direction.
+            // The same for an edge from either end: its length has no direction.
             for j in graph.edges_from(i).map(|x| x.1).chain(graph.edges_to(i).map(|x| x.1)) {
                 let v = sub(at[t][i], at[t][j]);
                 let long = length(v);

@@ -106,7 +106,7 @@ impl<F: Real> Graph<F> {
         self.edges
     }
 
-    /// Where each edge leads, with its length at rest and its weight.
+    /// Target of each edge, with its length at rest and its weight.
     pub(crate) fn all(&self) -> impl Iterator<Item = (u32, F, F)> + '_ {
         (0..self.near.len()).map(|e| (self.near[e], self.d0[e], self.weights[e]))
     }
@@ -126,7 +126,8 @@ impl<F: Real> Graph<F> {
         &self.weights
     }
 
-    /// Mean weight of the edges that tie two points; below [`LEAST_MEAN_WEIGHT`] nothing is held together. 0 without any.
+    /// Mean weight of the edges that tie two points; below [`LEAST_MEAN_WEIGHT`] nothing is held together. 0 without
+    /// any.
     pub(crate) fn mean_weight(&self) -> f64 {
         self.weights.iter().map(|w| w.f64()).sum::<f64>() / self.edges.max(1) as f64
     }
@@ -159,8 +160,8 @@ pub(crate) fn over_points<T: Send>(out: &mut [T], node: impl Fn(usize, &mut T) -
 }
 
 /// Every edge once, then both its ends. `near(i, &mut out[i], forces)` computes point i's edges, of which edge i·k + n
-/// has its place n in `forces`, and takes what they do to it; `far(&mut out[j], force)` takes what an edge does to its far end.
-/// Returns the sum of what `near` returned, in a fixed order.
+/// has its place n in `forces`, and receives their forces; `far(&mut out[j], force)` takes what an edge does to its far
+/// end. Returns the sum of what `near` returned, in a fixed order.
 pub(crate) fn over_edges<F: Real, T: Send, const N: usize>(
     graph: &Graph<F>,
     out: &mut [T],
@@ -260,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn few_and_coinciding_points_are_no_trouble() {
+    fn few_and_coinciding_points_are_supported() {
         let g = Graph::<f64>::new(&[], 4, Weigh::Median(1.0));
         assert!(g.is_empty() && g.mean_weight() == 0.0);
         let g = Graph::new(&[[1.0, 2.0, 3.0]], 4, Weigh::Median(1.0));

@@ -12,10 +12,10 @@
 //! d_x = ⟨w ∂S/∂⟨x⟩⟩ + 2x ⟨w ∂S/∂⟨xx+yy⟩⟩ + y ⟨w ∂S/∂⟨xy⟩⟩
 //! ```
 //!
-//! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
+//! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time pass
 //! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
-//! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
-//! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
+//! means and the gradient. Products and derivatives are in rings of 16 rows, which stay in the second-level cache. The
+//! loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 //!
 //! A windowed sum is eleven loads, five additions and six multiply-adds, so loads are what it waits for: scratch rows
 //! start at cache lines, rings are arrays whose offsets are constants, and sums are kept by column until a strip ends.
@@ -34,20 +34,20 @@ const C2: f64 = 9e-4;
 
 /// Passes run over whole AVX2 registers of f32, so that no loop has a scalar rest.
 const LANES: usize = 8;
-/// Rows that go through the pipeline together; a vertical pass then loads 14 rows for 44 products.
+/// Rows that pass the pipeline together; a vertical pass then loads 14 rows for 44 products.
 const GROUP: usize = 4;
 /// Rows a group's window spans.
 const SPAN: usize = GROUP + TAPS - 1;
 /// Rows in a ring: a span, rounded up to a power of two.
 const RING: usize = 16;
-/// Rows by which the place of the gradient's derivatives in the ring, ten rows back, is past a whole group.
+/// Rows by which the position of the gradient's derivatives in the ring, ten rows back, is past a whole group.
 const LAG: usize = (RING - 2 * REACH) % GROUP;
 /// Moments (x, y, xx+yy, xy) and derivatives.
 const MOMENTS: usize = 4;
 const DERIVATIVES: usize = 3;
 /// Widest run of columns worked on at a time, so that the rings fit the second-level cache.
 const MAX_COLUMNS: usize = 512;
-/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and room for [`READ`] from
+/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and space for [`READ`] from
 /// the derivatives' first column on.
 const STRIDE: usize = MAX_COLUMNS + 3 * PRODUCT_HALO;
 /// Most numbers that a horizontal pass reads of a row: a window's rest more than it makes.
@@ -223,7 +223,7 @@ impl<'a, F: Real> Tile<'a, F> {
         (self.job.first + row).checked_sub(halo).filter(|&y| y < self.job.height)
     }
 
-    /// Weights of the image row that derivative row `row` stands for.
+    /// Weights of the image row that derivative row `row` represents.
     #[inline(always)]
     fn fill_weights(&self, s: &mut Scratch<F>, row: usize) {
         let [start, end] = inside(self.job.width, self.x0, DERIVATIVE_HALO, self.columns + 2 * DERIVATIVE_HALO);
@@ -418,7 +418,7 @@ fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
     columns: [usize; 2],
     out: &mut Rows<F, MAPS, GROUP>,
 ) {
-    // Where the group stands in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
+    // Where the group is in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
     match head % RING / GROUP {
         0 => vertical_at::<F, FMA, MAPS>(taps, ring, PHASE, columns, out),
         1 => vertical_at::<F, FMA, MAPS>(taps, ring, GROUP + PHASE, columns, out),
@@ -427,7 +427,7 @@ fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
     }
 }
 
-/// The same from one place of the ring on.
+/// The same from one position of the ring on.
 #[inline(always)]
 fn vertical_at<F: Real, const FMA: bool, const MAPS: usize>(
     taps: &[F; TAPS],

@@ -1,10 +1,10 @@
 //! Losses on how the splats of any motion model move: from means and covariances at several times, without quaternions.
 //!
 //! The rotation that [`rigid`](super::rigid) reads from a Gaussian's quaternion is here its neighbourhood's, the best
-//! rotation of its neighbours' offsets ([`arap::rotations`](super::arap::rotations)), held constant in the gradient: for
-//! the sum of squares that is exact (the envelope theorem), for the robust forms below it is one step of reweighting.
-//! Every function adds `weight` times its gradient to all times and returns `weight` times its value; the same bits
-//! with any number of threads.
+//! rotation of its neighbours' offsets ([`arap::rotations`](super::arap::rotations)), held constant in the gradient:
+//! for the sum of squares that is exact (the envelope theorem), for the robust forms below it is one step of
+//! reweighting. Every function adds `weight` times its gradient to all times and returns `weight` times its value; the
+//! same bits with any number of threads.
 
 use super::LossSettings;
 use super::arap::{self, OWN_FLOOR};
@@ -40,8 +40,9 @@ pub(super) struct Scale {
     pub clip: f64,
 }
 
-/// All losses on motion that are on: adds their gradients to `d` and returns `loss` plus their values. `seen`: splats at the view's time and a frame
-/// later; if [`is_wide`], a frame before and two frames later; if [`is_far`], at any other time.
+/// All losses on motion that are on: adds their gradients to `d` and returns `loss` plus their values. `seen`: splats
+/// at the view's time and a frame later; if [`is_wide`], a frame before and two frames later; if [`is_far`], at any
+/// other time.
 ///
 /// A new loss is its formula below, a line here, and its weight in [`LossSettings`].
 pub(super) fn terms<F: Real>(
@@ -67,7 +68,7 @@ pub(super) fn terms<F: Real>(
             loss += rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
         }
         if w.velocity > 0.0 {
-            // From scene units a frame to extents a clip.
+            // From scene units per frame to extents a clip.
             let weight = w.velocity * (unit * clip).powi(2);
             loss += velocity(graph, [&x[1], &x[0]], weight, [now, before]);
         }
@@ -159,7 +160,7 @@ fn full<F: Real>([xx, xy, xz, yy, yz, zz]: [F; 6]) -> [[F; 3]; 3] {
 /// neighbourhood does. Covariances are packed (xx xy xz yy yz zz); the trace is held constant in the gradient, so that
 /// nothing is gained by growing.
 ///
-/// Source: ours; Luiten et al. 2024, equation 9, for models that answer with covariances.
+/// Source: ours; Luiten et al. 2024, equation 9, for models that result with covariances.
 pub(crate) fn rotation<F: Real>(
     graph: &Graph<F>,
     rotations: &[[[F; 3]; 3]],
@@ -240,8 +241,8 @@ pub(crate) fn isometry<F: Real>(
         })
 }
 
-/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the way from one time to the next: neighbours
-/// move alike. Edges count alike, whatever the graph's weights say.
+/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the displacement from one time to the next:
+/// neighbours move alike. Edges count alike, independent of the graph's weights.
 pub(crate) fn velocity<F: Real>(
     graph: &Graph<F>,
     [now, before]: [&[[F; 3]]; 2],

@@ -58,7 +58,7 @@ impl Near {
         self.lock().iter().flat_map(layer).collect()
     }
 
-    /// Takes back what [`state`](Self::state) gave; what cannot be neighbours is searched again.
+    /// Restores the result of [`state`](Self::state); invalid neighbours are searched again.
     pub(crate) fn restore(&self, state: &[u32]) {
         let mut found = self.lock();
         found.clear();

@@ -15,11 +15,11 @@ pub(crate) const CENTRES: usize = 1024;
 /// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
 const FALLOFF: f64 = 1.0;
 
-/// Rigidity, rotation, isometry, ARAP, elasticity, velocity, jerk, acceleration and least motion of the Gaussians of every layer that moves, over
-/// random neighbourhoods of those alive at the view's time.
+/// Rigidity, rotation, isometry, ARAP, elasticity, velocity, jerk, acceleration and least motion of the Gaussians of
+/// every layer that moves, over random neighbourhoods of those alive at the view's time.
 ///
 /// Neighbours are those of the raw means, searched again every 200 steps and after every edit of rows; an edge counts
-/// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
+/// only where both of its ends are alive. The neighbourhoods of a step are a function of seed and step.
 pub(crate) struct Neighbourhood<F> {
     weights: LossSettings,
     /// 1/extent
@@ -28,17 +28,17 @@ pub(crate) struct Neighbourhood<F> {
     frame: f64,
     clip: [f64; 2],
     near: Near,
-    /// Of the step that is under way: a graph over the rows of each probe.
+    /// Of the step that is in flight: a graph over the rows of each probe.
     graphs: Mutex<Vec<Graph<F>>>,
 }
 
 impl<F: Real> Neighbourhood<F> {
-    /// For a scene of this extent (scene units), over a clip (seconds) of so many frames a second.
+    /// For a scene of this extent (scene units), over a clip (seconds) of this many frames per second.
     pub(crate) fn new(weights: LossSettings, extent: f64, clip: [f64; 2], fps: f64) -> Self {
         Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }
 
-    /// Times of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one
+    /// Times of a step: two a frame apart from the first view's time on; then, if requested, one frame before and one
     /// after them; then any other.
     fn times(&self, info: &StepInfo, layer: usize) -> Option<Vec<Time>> {
         let seconds = self.clip[1] - self.clip[0];
@@ -93,10 +93,9 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
 
     fn eval(&self, _scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64 {
         let graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
-        assert_eq!(graphs.len(), probes.len(), "eval answers the probes of the same step");
+        assert_eq!(graphs.len(), probes.len(), "`eval` gets the probes of the same step");
         let clip = (self.clip[1] - self.clip[0] + self.frame) / self.frame;
-        // From scene units a frame to extents a clip.
-        // In the order of time: before, at, after, after that.
+        // From scene units per frame to extents a clip. In the order of time: before, at, after, after that.
         let scale = motion::Scale { unit: self.unit, clip };
         let layers = graphs.iter().zip(seen).zip(d);
         layers.fold(0.0, |loss, ((graph, seen), d)| motion::terms(&self.weights, scale, graph, seen, d, loss))
@@ -115,8 +114,8 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
     }
 }
 
-/// Up to [`CENTRES`] of the rows `alive`, with their neighbours among them: the rows, ascending, and a graph in which only
-/// the centres' edges count.
+/// Up to [`CENTRES`] of the rows `alive`, with their neighbours among them: the rows, ascending, and a graph in which
+/// only the centres' edges count.
 fn sample<F: Real>(means: &Table<F>, near: &[u32], alive: &[u32], rng: Rng) -> (Vec<u32>, Graph<F>) {
     let count = alive.len().min(CENTRES);
     // One of every stratum: sorted and never twice.

@@ -1,6 +1,6 @@
 //! The image loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
-use super::image::{ImageTerm, LossValue, PictureGrads, Shown, View};
+use super::image::{ImageTerm, LossGrads, LossValue, Shown, View};
 use super::kernel::{self, Scratch, Strip};
 use super::terms::StepInfo;
 use rayon::prelude::*;
@@ -10,8 +10,8 @@ use splat4d::scene::Planes;
 use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
-/// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so that
-/// sums do not depend on the number of threads. Every strip works on a window's halo of ten rows in addition.
+/// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so
+/// that sums do not depend on the number of threads. Every strip works on a window's halo of ten rows in addition.
 const STRIP_ROWS: usize = 128;
 /// Strips are whole groups of rows of the kernel.
 const GROUP_ROWS: usize = 4;
@@ -23,7 +23,7 @@ pub struct Photometric<F = f32> {
     pub lambda_dssim: f32,
     simd: Simd,
     taps: [F; kernel::TAPS],
-    /// One a thread of the pool; a thread holds its own only while it works on one strip.
+    /// One per thread of the pool; a thread holds its own only while it works on one strip.
     scratch: Vec<Mutex<Scratch<F>>>,
     /// [channels, strips] sums, added up in order.
     sums: Vec<[f64; 3]>,
@@ -124,7 +124,7 @@ impl<F: Real> Photometric<F> {
     }
 }
 
-/// The sum of weights, strip by strip of `length` numbers; `sums` has room for one a strip.
+/// The sum of weights, strip by strip of `length` numbers; `sums` holds one per strip.
 fn total<F: Real>(weight: &[F], length: usize, sums: &mut [[f64; 3]]) -> f64 {
     const LANES: usize = 8;
     weight.par_chunks(length).zip(&mut *sums).for_each(|(strip, sum)| {
@@ -137,7 +137,7 @@ fn total<F: Real>(weight: &[F], length: usize, sums: &mut [[f64; 3]]) -> f64 {
 }
 
 impl<F: Real> ImageTerm<F> for Photometric<F> {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         self.measured = match d.color.overwrite() {
             Some(d_color) => self.loss_and_grad(shown.color, view.truth, view.weight, d_color),
             None => {

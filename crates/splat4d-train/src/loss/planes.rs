@@ -52,7 +52,7 @@ impl SmoothPlanes {
     /// Its name, in metrics.
     pub(crate) const NAME: &'static str = "planes";
 
-    /// For planes of one shape, of which so many levels are in use.
+    /// For planes of one shape, of which this many levels are in use.
     pub(crate) fn new(shape: PlaneShape, levels: usize, weights: PlaneWeights) -> Self {
         Self { shape, levels, weights }
     }

@@ -3,12 +3,13 @@
 //! For every edge i → j of a [`Graph`], with q_rel = q̂_t ⊗ conj(q̂_{t−1}) of the normalised quaternions, R its matrix,
 //! e = x_j − x_i now and e⁰ before:
 //! - rigidity: mean √(w ‖R_iᵀ e − e⁰‖² + ε), scene units;
-//! - rotation: mean √(w ‖q_rel,j − s q_rel,i‖² + ε), no unit; s = ±1 picks the nearer of the two signs of one turn (ours);
+//! - rotation: mean √(w ‖q_rel,j − s q_rel,i‖² + ε), no unit; s = ±1 picks the nearer of the two signs of one turn
+//!   (ours);
 //! - isometry: mean √(w (‖e‖ − d0)² + ε), scene units; d0 is the graph's length at rest, not the time before.
 //!
-//! The root makes them robust, like an L1: one torn edge does not move its neighbours. Gradients go to the later time;
-//! what was before is known. Every function adds `weight` times its gradient and returns `weight` times its value; the
-//! same bits with any number of threads.
+//! The root makes them robust, like an L1: one torn edge does not move its neighbours. Gradients are those of the later
+//! time; the earlier state is fixed. Every function adds `weight` times its gradient and returns `weight` times its
+//! value; the same bits with any number of threads.
 //! Source: Luiten et al. 2024, "Dynamic 3D Gaussians", equations 8 to 10.
 
 use super::graph::{Graph, add_to, length, over_edges, over_points, square, sub, turn, turn_back};
@@ -18,7 +19,7 @@ use splat4d::math::{Real, quat};
 /// Keeps the root's derivative finite where an edge is exactly as it was (Luiten et al. 2024).
 const UNDER_ROOT: f64 = 1e-20;
 
-/// Where points are and how they are turned at a time.
+/// Positions and rotations of points at a time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Poses<'a, F> {
     /// Positions, scene units.

@@ -10,7 +10,8 @@ use splat4d::render::RowWeights;
 use splat4d::scene::params::{LOG_SCALE, OPACITY};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
-/// Adds `f`'s gradient over the active rows of every layer's geometry, weighted `weight`/(active rows); returns the loss.
+/// Adds `f`'s gradient over the active rows of every layer's geometry, weighted `weight`/(active rows); returns the
+/// loss.
 fn over_active<F: Real>(
     scene: &Scene<F>,
     d: &mut [Grads<F>],
@@ -39,7 +40,7 @@ fn over_active<F: Real>(
     loss
 }
 
-/// weight · mean opacity (3DGS as MCMC): makes room for relocation.
+/// weight · mean opacity (3DGS as MCMC): frees Gaussians for relocation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MeanOpacity {
     /// λ
@@ -124,7 +125,7 @@ impl<F: Real> ParamLoss<F> for MeanScale {
 }
 
 /// weight · mean over Gaussians and views of o·stopgrad[σ(t)] (FreeTimeGS §3.4): against opaque long-lived blockers.
-/// The gradient goes to the opacity alone.
+/// Only the opacity has a gradient.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LivingOpacity {
     /// λ_reg
@@ -160,7 +161,7 @@ pub(crate) struct VelocitySmoothness {
 }
 
 impl VelocitySmoothness {
-    /// `unit` turns scene units a second into extents a clip.
+    /// `unit` turns scene units per second into extents a clip.
     pub(crate) fn new(weight: f64, unit: f64) -> Self {
         Self { weight, unit, neighbours: Near::default() }
     }

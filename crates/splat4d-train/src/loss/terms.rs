@@ -1,5 +1,5 @@
-//! The contracts of losses that do not look at an image: on splats at several times, and on raw parameters; and of what
-//! may stand between parameters and images, a [`Codec`].
+//! The contracts of losses without images: on splats at several times, and on raw parameters; and of what may be
+//! between parameters and images, a [`Codec`].
 
 use crate::Result;
 use splat4d::layers::Scene;
@@ -7,7 +7,7 @@ use splat4d::math::Real;
 use splat4d::render::{ResidentTies, RowWeights};
 use splat4d::scene::{Grads, Space, Table, Time};
 
-/// Where in training a loss is asked.
+/// Stage and step of a loss.
 #[derive(Clone, Debug)]
 pub struct StepInfo {
     /// Steps taken before this one.
@@ -20,7 +20,7 @@ pub struct StepInfo {
     pub progress: f64,
 }
 
-/// The rows and times that a loss over several times wants to see.
+/// The rows and times that a loss over several times needs to see.
 #[derive(Clone, Debug)]
 pub struct Probe {
     /// Which layer.
@@ -47,7 +47,7 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
-    /// Takes back what [`state`](Self::state) gave.
+    /// Restores the result of [`state`](Self::state) gave.
     fn restore(&self, _state: &[u32]) {}
 }
 
@@ -66,7 +66,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn name(&self) -> &str;
     /// The loss; adds to one `Grads` a layer.
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
-    /// The same as a device knows it; none: the CPU must take it.
+    /// The same for a device; none: the CPU must compute it.
     fn kept(&self) -> Option<ResidentLoss> {
         None
     }
@@ -80,13 +80,13 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
-    /// Takes back what [`state`](Self::state) gave.
+    /// Restores the result of [`state`](Self::state) gave.
     fn restore(&self, _state: &[u32]) {}
 }
 
-/// A codec between the parameters that learn and the images they are judged by: a file that will hold them
-/// coarsely. Images are drawn from what its reader would see, and the gradient goes to the parameters as if there were
-/// no difference (the straight-through estimator: Bengio et al. 2013).
+/// A codec between the parameters that learn and the images they are judged by: a file that will hold them coarsely.
+/// Images are rendered from the decoded values, and the gradient is passed to the parameters as if there were no
+/// difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.
     fn name(&self) -> &str;
@@ -95,9 +95,9 @@ pub trait Codec<F: Real>: Send + Sync {
     fn show(&self, scene: &Scene<F>, times: &[Time], shown: &mut Scene<F>);
     /// All of `scene` as a reader would see it. Changes nothing of what `show` remembers.
     fn whole(&self, scene: &Scene<F>) -> Scene<F>;
-    /// After a step's gradients, before the parameters' own optimiser: learns what rows share and hears which rows are
-    /// about to change. `progress` is the share of the stage that is done; every rate is multiplied by `scale`. Returns
-    /// whether all numbers are finite.
+    /// After a step's gradients, before the parameters' own optimiser: learns what rows share and is notified which
+    /// rows are about to change. `progress` is the share of the stage that is done; every rate is multiplied by
+    /// `scale`. Returns whether all numbers are finite.
     fn learn(&self, d: &mut [Grads<F>], progress: f64, scale: f64) -> bool;
     /// The scene changed in other ways than by a step: whatever was shown of it is stale.
     fn reset(&self) {}
@@ -105,7 +105,7 @@ pub trait Codec<F: Real>: Send + Sync {
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
-    /// Takes back what [`state`](Self::state) gave. Errors: words that cannot be such a state.
+    /// Restores the result of [`state`](Self::state) gave. Errors: words that cannot be such a state.
     fn restore(&self, _state: &[u32]) -> Result<()> {
         Ok(())
     }

@@ -4,8 +4,8 @@
 //! rotation and isometry (see [`super::rigid`]), and a floor, mean max(h − up·x, 0). Over the background: the mean of
 //! ‖x − x₀‖₁ + ‖q − q₀‖₁ to frame 0. Over all: the mean of ‖rgb − rgb'‖₁ to the colours that the frame began with.
 //!
-//! The paper's weights are for metres; here every length is divided by a unit that the program chooses, so that scenes of
-//! any unit are held alike. Gradients go to the newest page and to the base colour alone.
+//! The paper's weights are for metres; here every length is divided by a unit that the program chooses, so that scenes
+//! of any unit are treated alike. Gradients are those of the newest page and to the base colour alone.
 
 use super::graph::{Graph, Weigh};
 use super::rigid::{Poses, isometry, rigidity, rotation};

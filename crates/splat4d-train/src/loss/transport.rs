@@ -5,11 +5,11 @@
 //! |---|---|
 //! | temporal | ½ (D(a, b) + D(b, c)): small motion |
 //! | second | D(c, P(b, a)), P at constant velocity (log and exp): steady motion, fast or slow, costs nothing |
-//! | align | D(o, F) between the model's own answer o and the state F that the filter makes of it (`align.rs`) |
+//! | align | D(o, F) between the model's own result o and the state F that the filter makes of it (`align.rs`) |
 //!
 //! D = (‖Δμ‖² + m·B²)/extent² with B² the covariances' part of W₂², or ‖Δμ‖²/extent² alone in the linear variant. The
 //! multiplier m is needed because motion is 10² to 10⁴ times what shapes change (squared). Frames are those around a
-//! view's own, so that one of three answers is there anyhow, in a share of the steps whose terms weigh that much more.
+//! view's own, so that one of three results already exists, in a share of the steps whose terms weigh that much more.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS"); second order and normalisation are ours.
 
@@ -69,7 +69,7 @@ impl Choice for Option<Metric> {
 pub(crate) struct TransportConfig {
     /// The quantities that distances are between.
     pub metric: Metric,
-    /// How shapes go on at constant velocity.
+    /// How shapes continue at constant velocity.
     pub predictor: Predictor,
     /// Weight of the temporal term.
     pub temporal: f64,
@@ -85,7 +85,7 @@ pub(crate) struct TransportConfig {
     pub clip: [f64; 2],
     /// Seconds between frames.
     pub frame: f64,
-    /// Share of the steps that are looked at, above 0.
+    /// Share of the steps in which it is computed, above 0.
     pub every: f64,
     /// Share of the stage after which the loss begins.
     pub start: f64,
@@ -128,7 +128,7 @@ impl TransportConfig {
 pub(crate) struct Transport {
     settings: TransportConfig,
     layer: usize,
-    /// The schedule's factor in the step whose probes were asked last, as bits.
+    /// The schedule's factor in the step whose probes were queried last, as bits.
     now: AtomicU64,
 }
 
@@ -150,7 +150,7 @@ impl Transport {
             return None;
         }
         let own = info.times.first().map_or(s.clip[0], |t| t.0);
-        // A view's time stays the number it is, so that its question is shared.
+        // A view's time stays the number it is, so that its query is shared.
         let middle = own.max(s.clip[0] + s.frame).min(s.clip[1] - s.frame);
         Some([middle - s.frame, middle, middle + s.frame].map(Time))
     }
@@ -210,13 +210,13 @@ impl<F: Real> ProbeLoss<F> for Transport {
     }
 
     fn eval(&self, _: &Scene<F>, _: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64 {
-        let [a, b, c] = &seen[0][..] else { unreachable!("the loss asked for three times") };
+        let [a, b, c] = &seen[0][..] else { unreachable!("the loss requested three times") };
         if a.rows() == 0 {
             return 0.0;
         }
         let factor = f64::from_bits(self.now.load(Ordering::Relaxed));
         let weight = factor / (self.settings.every.min(1.0) * a.rows() as f64);
-        let [d_a, d_b, d_c] = &mut d[0][..] else { unreachable!("a gradient has its answers' shape") };
+        let [d_a, d_b, d_c] = &mut d[0][..] else { unreachable!("a gradient has its results' shape") };
         par_split([d_a, d_b, d_c].map(Table::view_mut), &|mut views| {
             let mut sum = 0.0;
             for j in views[0].first..views[0].first + views[0].rows {

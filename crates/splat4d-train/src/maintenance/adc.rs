@@ -1,12 +1,13 @@
-//! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
+//! Adaptive density control: clone small and split large Gaussians whose screen position still needs to move; prune the
 //! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the clone's opacity as revised by Bulò 2024.
 //!
-//! Gaussians with a life and a path of their own that leave their own place within that life are split in time instead:
-//! the two halves follow the same path one after the other. What turns or speeds up needs shorter lives, which parts
-//! next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well, at random.
+//! Gaussians with a lifespan and a path of their own that leave their own place within that life are split in time
+//! instead: the two halves follow the same path one after the other. Rotation and acceleration need shorter lifespans,
+//! which parts next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well,
+//! at random.
 //!
-//! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and a
-//! wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
+//! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and
+//! a wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
 //! captures and nothing on an object (docs/suite.md).
 
 use super::{
@@ -26,7 +27,7 @@ use splat4d::scene::{Born, GEOMETRY, LIFE, LifeKind, RowEdit, Space, Table};
 /// A split's parts are this much smaller than their parent, in space or in time.
 const SPLIT_SHRINK: f64 = 1.6;
 /// How far from the centre of the parent's life those of a split in time begin, in widths of the parent's: with
-/// [`SPLIT_SHRINK`] mean and variance of the two lives together are the parent's, √(1 − 1/1.6²).
+/// [`SPLIT_SHRINK`] mean and variance of the two lifespans together are the parent's, √(1 − 1/1.6²).
 const TIME_SHIFT: f64 = 0.78;
 /// Address of the random numbers of [`retime`]; those of splits are addressed by row.
 const RETIME: u64 = u64::MAX;
@@ -43,8 +44,8 @@ settings! {
         retime_clones: bool = false;
         /// Mean 2D gradient above which a Gaussian is cloned or split (NDC units).
         grad_threshold: f64 = 2e-4;
-        /// Gaussians larger than this share of the extent are split, smaller ones cloned; 0: 0.01, and less in proportion
-        /// for static scenes of more than 30,000 Gaussians.
+        /// Gaussians larger than this share of the extent are split, smaller ones cloned; 0: 0.01, and less in
+        /// proportion for static scenes of more than 30,000 Gaussians.
         percent_dense: f64 = 0.0 => any().unit("extents");
         /// Share of densification after which the cap may be reached: the number of Gaussians grows along a parabola
         /// (Mallick et al. 2024), largest gradients first; 0: no limit before the cap.
@@ -56,8 +57,8 @@ settings! {
 
 /// [`AdcSettings::percent_dense`] where it is 0, for few Gaussians (Kerbl et al. 2023).
 pub(crate) const DENSE: f64 = 0.01;
-/// The lowest that it becomes with many (Ren et al. 2026, FastGS). More Gaussians are smaller, and one that is large among them
-/// blurs what a copy in its place blurs as well (studies/records/2026-11-27-real-size.md).
+/// The lowest that it becomes with many (Ren et al. 2026, FastGS). More Gaussians are smaller, and one that is large
+/// among them blurs what a copy in its place blurs as well (studies/records/2026-11-27-real-size.md).
 pub(crate) const FINEST: f64 = 1e-3;
 
 /// Adaptive density control (Kerbl et al. 2023).
@@ -100,8 +101,8 @@ impl Maintenance for Adc {
 }
 
 impl Adc {
-    /// The share of the room below the cap that may be taken now: of what was there at first a share (1 − x)² is left when
-    /// the share x of the time until the cap has passed.
+    /// The share of the free number below the cap that may be used now: of the initial one a share (1 − x)² is left
+    /// when the share x of the time until the cap has passed.
     fn share(&self, at: &At) -> f64 {
         let Every { first, last, interval } = self.steps;
         if last == usize::MAX {
@@ -120,13 +121,13 @@ impl Adc {
 }
 
 impl AdcSettings {
-    /// How far from the centre of a row's life those of its halves lie, seconds; 0: it is not split in time.
+    /// How far from the centre of a row's lifespan those of its halves lie, seconds; 0: no split in time.
     fn part(&self, scene: &Scene<f32>, layer: usize, row: usize, size: f64) -> f64 {
         let Layer { motion, params, life, .. } = &scene.layers[layer];
         let Some(path) = motion.polynomial().filter(|_| *life != LifeKind::Infinite && self.split_in_time > 0.0) else {
             return 0.0;
         };
-        // A life that is longer than the clip counts as the clip.
+        // A lifespan that is longer than the clip counts as the clip.
         let clip = 0.5 * (scene.clip[1] - scene.clip[0]);
         let width = f64::from(params[LIFE].get(row, LOG_WIDTH)).exp().min(clip);
         let way = path.travel(params, row, width);
@@ -150,7 +151,7 @@ impl AdcSettings {
         let keep: Vec<bool> = (0..rows).map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r])).collect();
         let removed = keep.iter().filter(|k| !**k).count();
         *spare += removed;
-        // Those that want it most come first when the cap leaves no room for all.
+        // Those that need it most come first when the cap leaves no room for all.
         let mut wanting: Vec<(f32, u32)> = (0..rows)
             .filter(|&r| keep[r] && f64::from(stats.gradient(layer, r)) >= self.grad_threshold)
             .map(|r| (stats.gradient(layer, r), r as u32))
@@ -192,8 +193,9 @@ impl AdcSettings {
                 layer.resize(j, 1.0 / SPLIT_SHRINK);
             }
             if grows[r] && !splits[r] {
-                // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller and
-                // are next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
+                // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller
+                // and are next to each other; as faint as this they let training views fall by up to 2 dB
+                // (docs/suite.md).
                 layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }
@@ -201,15 +203,15 @@ impl AdcSettings {
     }
 }
 
-/// Makes a row one half of its life: its centre `shift` seconds later, but within the clip, and shorter.
+/// Makes a row one half of its lifespan: its centre `shift` seconds later, but within the clip, and shorter.
 fn shorten(layer: &mut Layer<f32>, row: usize, shift: f64, [first, last]: [f64; 2]) {
-    let path = layer.motion.polynomial().expect("who was asked how far it goes has a path");
+    let path = layer.motion.polynomial().expect("a model with a reach has a path");
     let center = f64::from(layer.params[LIFE].get(row, CENTER));
     path.recentre(&mut layer.params, row, (center + shift).clamp(first, last) - center);
     layer.params[LIFE].set(row, LOG_WIDTH, (shift.abs() / TIME_SHIFT / SPLIT_SHRINK).ln() as f32);
 }
 
-/// Draws the centre of every clone's life from the clip, uniformly.
+/// Draws the centre of every clone's lifespan from the clip, uniformly.
 fn retime(life: &mut Table, edit: &RowEdit, [first, last]: [f64; 2], rng: Rng) {
     if life.width() == 0 {
         return;
@@ -272,8 +274,8 @@ mod tests {
         layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 4);
         let velocities = layer.params.find("velocities").unwrap();
         let size = (-2.0f32).exp();
-        // Row 0 goes three times its size in a width of its life and row 1 half of it; row 2 lives longer than the clip;
-        // row 3 is fast, but no rule splits it.
+        // Row 0 goes three times its size in a width of its lifespan and row 1 half of it; row 2 lives longer than the
+        // clip; row 3 is fast, but no rule splits it.
         for (row, [life, way]) in [[0.5, 3.0], [0.5, 0.5], [50.0, 3.0], [0.5, 3.0]].into_iter().enumerate() {
             layer.params[LIFE].write(row, 0, [2.5, f32::ln(life)]);
             layer.params[velocities].write(row, 0, [way * size / life.min(2.0), 0.0, 0.0, 0.0, 0.01, 0.0]);

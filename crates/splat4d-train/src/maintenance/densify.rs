@@ -20,7 +20,8 @@ settings! {
     pub struct DensifySettings {
         /// Densification: adc, mcmc or none.
         strategy: Strategy = Strategy::Adc;
-        /// Largest number of Gaussians; 0: from the pixels of all distinct views, the steps and the memory, at least 30,000.
+        /// Largest number of Gaussians; 0: from the pixels of all distinct views, the steps and the memory, at least
+        /// 30,000.
         max_cap: usize = 0;
         /// Factor on the number of Gaussians that follows from the capture; without effect if `max_cap` is set.
         count_scale: f64 = 1.0 => positive();
@@ -45,7 +46,7 @@ const MCMC_DEAD_OPACITY: f64 = 0.005;
 const ADC_DEAD_OPACITY: f64 = 0.02;
 
 /// Gaussians that small captures are tuned for (docs/suite.md); what a capture's own number never falls below, and what
-/// holds where no capture was looked at.
+/// applies without a capture.
 pub(crate) const LEAST: usize = 30_000;
 
 impl DensifySettings {

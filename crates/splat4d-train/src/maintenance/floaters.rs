@@ -1,9 +1,10 @@
-//! Removal of floaters: Gaussians that hang right before a camera that does not see them, and that one camera alone sees.
+//! Removal of floaters: Gaussians that hang right before a camera that does not see them, and that one camera alone
+//! sees.
 //!
-//! One camera's images say nothing about depth, so that what it alone sees drifts along its rays, and some of it
-//! comes to rest
-//! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it, or
-//! farther away. What stands before the camera that sees it may be there, and stays; so does all that two cameras see.
+//! One camera's images carry no information about depth, so that Gaussians that it alone sees drift along its rays, and
+//! some of them stay between the other cameras, where they veil every view. Their content is learnt again where others
+//! see it, or farther away. A Gaussian in front of the camera that sees it may be correct and is kept, as are those
+//! that two cameras see.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder};
 use crate::Result;
@@ -29,9 +30,10 @@ settings! {
     }
 }
 
-/// Of fewer places most of a scene is seen from one alone: nothing is removed (of four real cameras it cost 0.4 to 1.5 dB).
+/// Of fewer places most of a scene is seen from one alone: nothing is removed (of four real cameras it cost 0.4 to 1.5
+/// dB).
 const FEWEST: usize = 8;
-/// Moments, evenly over the clip, at which Gaussians are looked at; each counts where it is most visible.
+/// Times, evenly over the clip, at which Gaussians are examined; each counts where it is most visible.
 const MOMENTS: usize = 5;
 
 /// Rows in a task.
@@ -155,7 +157,7 @@ impl<'a> Places<'a> {
             }
             !veils
         };
-        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not asked.
+        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not tested.
         let rows = points.par_chunks(NEIGHBOURS).flat_map_iter(|points| {
             let mut hint = [0; 2];
             points.iter().map(move |&x| stays(&mut hint, x))
@@ -184,7 +186,8 @@ mod tests {
         let frames = Made::new(8, 1, 16);
         let places = Places::of(&frames);
         assert_eq!(places.cameras.len(), 8);
-        // Where one camera alone looks, as near to another one as can be found; right before a camera that sees it; all else.
+        // Where one camera alone looks, as near to another one as can be found; right before a camera that sees it; all
+        // else.
         let near = |x: [f64; 3]| {
             let unseen = |(camera, _): &&(&Camera, [f64; 3])| seen(camera, x).is_none();
             let to = |(_, place): &(&Camera, [f64; 3])| norm(sub(x, *place));

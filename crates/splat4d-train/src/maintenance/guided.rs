@@ -1,9 +1,8 @@
-//! Guided sampling: where images are worst and there are too few Gaussians to mend them, new ones are put along the
-//! rays
-//! of the worst patches. It finds what no initial point stood for, far backgrounds above all.
+//! Guided sampling: where images are worst and Gaussians are too few, new ones are placed along the rays of the worst
+//! patches. It finds what no initial point represented, far backgrounds above all.
 //!
-//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches of
-//! 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
+//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the examined views the two worst; patches of 16
+//! pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
 //! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
 use super::{At, Change, Context, Maintenance, RunOrder, logit};
@@ -20,8 +19,8 @@ use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
 
-/// Views that are looked at each time.
-const LOOKS: usize = 24;
+/// Views that are examined each time.
+const VIEWS: usize = 24;
 /// Views in which Gaussians are added.
 const WORST_VIEWS: usize = 2;
 /// Side of a patch, pixels.
@@ -62,7 +61,7 @@ settings! {
     }
 }
 
-/// A view that was looked at.
+/// An examined view.
 struct ViewError {
     frame: usize,
     error: f64,
@@ -140,7 +139,7 @@ impl Maintenance for Guided {
             geometry.set(row, OPACITY, logit(OPACITY_START));
             p[SH].write(row, 0, point.color.map(rgb_to_dc));
             if p[LIFE].width() >= 2 {
-                // As long as the clip, around the moment at which it was missed.
+                // As long as the clip, around the time of the error.
                 p[LIFE].write(row, 0, [point.time.0 as f32, clip.ln() as f32]);
             }
         }
@@ -153,7 +152,7 @@ fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng
     let mut backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
     let mut worst: Vec<ViewError> = Vec::new();
-    let count = LOOKS.min(frames.len());
+    let count = VIEWS.min(frames.len());
     for k in 0..count {
         let frame = ((k as f64 + rng.uniform(0)) * frames.len() as f64 / count as f64) as usize;
         let frame = frame.min(frames.len() - 1);
@@ -262,7 +261,7 @@ mod tests {
         let g = &s.layers[0].params[GEOMETRY];
         for row in 200..s.len() {
             let mean = g.read::<3>(row, 0).map(f64::from);
-            // Somewhere it stands at the middle of a pixel of a frame, in that pixel's colour.
+            // Somewhere it is at the middle of a pixel of a frame, in that pixel's colour.
             let dc = s.layers[0].params[SH].read::<3>(row, 0);
             let found = (0..12).any(|i| {
                 let Some(([u, v], _)) = frames.camera(i).project(mean) else { return false };

@@ -1,7 +1,8 @@
 //! Densification as Markov chain Monte Carlo: dead Gaussians are moved onto live ones so that the image stays the same,
 //! the cloud grows by 5 % a time up to the cap, and positions are shaken while a Gaussian is nearly transparent.
 //!
-//! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
+//! Their targets are drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its lifespan with
+//! it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
 use super::{
@@ -39,7 +40,7 @@ settings! {
 pub(crate) struct Mcmc {
     /// How.
     pub settings: McmcSettings,
-    /// Share of the 2D gradient, against opacity, in where Gaussians go.
+    /// Share of the 2D gradient, against opacity, in the choice of targets.
     pub gradient_share: f64,
     /// When.
     pub steps: Every,
@@ -80,7 +81,7 @@ impl Maintenance for Mcmc {
     }
 }
 
-/// Opacity and scale factor of each of `copies` Gaussians that together look like one of opacity `o`.
+/// Opacity and scale factor of each of `copies` Gaussians that together render like one of opacity `o`.
 ///
 /// o' = 1 − (1−o)^{1/N}; s'/s = o / Σ_{i=1..N} Σ_{k=0..i−1} C(i−1,k) (−1)^k o'^{k+1} / √(k+1): along every line through
 /// the centre the integrated alpha is the same.
@@ -125,7 +126,7 @@ impl Mcmc {
     }
 }
 
-/// Where Gaussians go: rows drawn in proportion to share·gradient + (1 − share)·opacity, each over its mean.
+/// Targets of Gaussians: rows drawn in proportion to share·gradient + (1 − share)·opacity, each over its mean.
 pub(super) struct Places {
     layer: usize,
     live: Vec<usize>,
@@ -133,7 +134,7 @@ pub(super) struct Places {
 }
 
 impl Places {
-    /// The `live` rows of a layer; where nothing was seen to have a gradient, opacity alone counts.
+    /// The `live` rows of a layer; where no gradient was recorded, only opacity counts.
     pub(super) fn new(train_state: &TrainState, layer: usize, live: Vec<usize>, share: f64) -> Self {
         let mean = |f: &dyn Fn(usize) -> f64| (live.iter().map(|&r| f(r)).sum::<f64>() / live.len() as f64).max(1e-30);
         let gradient = |r: usize| f64::from(train_state.stats().gradient(layer, r));
@@ -151,15 +152,15 @@ impl Places {
         Self { layer, live, cumulative }
     }
 
-    /// The i-th draw.
+    /// The i-th sample.
     fn draw(&self, rng: Rng, i: u64) -> usize {
         let u = rng.uniform(i) * self.cumulative.last().expect("a live row is there to be drawn");
         self.live[self.cumulative.partition_point(|&c| c <= u).min(self.live.len() - 1)]
     }
 }
 
-/// Moves the rows `moves` (increasing) onto drawn places of the same layer and adds `added` more there; those that share a
-/// place then look together as its one Gaussian did: [`relocated`].
+/// Moves the rows `moves` (increasing) onto sampled positions of the same layer and adds `added` more there; those that
+/// share a position then render together as the one Gaussian before: [`relocated`].
 pub(super) fn join(
     train_state: &mut TrainState,
     limits: &Limits,

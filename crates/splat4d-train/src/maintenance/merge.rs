@@ -1,4 +1,4 @@
-//! Too many Gaussians in one place: near pairs become one (merging), or the fainter of a pair goes (spatial-proximity
+//! Too many Gaussians in one place: near pairs are merged, or the fainter of a pair is removed (spatial-proximity
 //! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
 
 use super::{At, Change, Context, Maintenance, RunOrder, covariances, logit, opacity};
@@ -19,7 +19,7 @@ pub enum Pair {
     None,
     /// One Gaussian with the pair's mean, covariance (moments), colour and joint opacity.
     Merge,
-    /// The fainter one goes, the other stays as it is.
+    /// The fainter one is removed, the other unchanged.
     Prune,
 }
 
@@ -43,7 +43,7 @@ impl Choice for Pair {
         &[("none", Self::None), ("merge", Self::Merge), ("prune", Self::Prune)];
 }
 
-/// Largest difference of base colours (in SH coefficients, each channel) of a pair that is one thing.
+/// Largest difference of base colours (in SH coefficients, each channel) of a pair to merge.
 const SAME_COLOR: f32 = 0.15;
 /// Largest ratio of a pair's standard deviations.
 const SAME_SIZE: f64 = 2.0;
@@ -89,7 +89,7 @@ impl Merge {
 }
 
 impl MergeSettings {
-    /// One round on one layer: changes the rows that stay, and says which do. `None`: there is no pair.
+    /// One round on one layer: changes the rows that stay, and states which do. `None`: there is no pair.
     fn edit(&self, train_state: &mut TrainState, layer: usize) -> Option<RowEdit> {
         let n = train_state.scene().layers[layer].params.len();
         let pairs = self.pairs(train_state.scene(), layer);
@@ -109,7 +109,7 @@ impl MergeSettings {
         }
         let mut edit = RowEdit::prune(Space::Gaussians, keep.iter().copied());
         if self.pair == Pair::Merge {
-            // Moments of what a merged row was would push it back.
+            // The old moments of a merged row would push it back.
             let mut merged = vec![false; n];
             pairs.iter().for_each(|&(a, b)| (merged[a], merged[b]) = (true, true));
             for (born, row) in edit.born.iter_mut().zip(&edit.parent) {
@@ -121,7 +121,7 @@ impl MergeSettings {
         Some(edit)
     }
 
-    /// Pairs (a < b) of rows that are each other's nearest and alike in place, size, colour and life.
+    /// Pairs (a < b) of rows that are each other's nearest and alike in place, size, colour and lifespan.
     fn pairs(&self, scene: &Scene<f32>, layer: usize) -> Vec<(usize, usize)> {
         let l = &scene.layers[layer];
         let (n, g) = (l.params.len(), &l.params[GEOMETRY]);
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_come_at_their_interval_but_not_at_the_end() {
+    fn rounds_run_at_their_interval_but_not_at_the_end() {
         let settings = MergeSettings { pair: Pair::Prune, distance: 0.5, interval: 10 };
         let mut merge = Merge { settings };
         assert_eq!(due_steps(&merge, 30), [10, 20]);

@@ -1,11 +1,13 @@
 //! Maintenance of a learner between steps: Gaussians are added, moved, merged and removed, control nodes follow,
 //! opacities are lowered, rows are sorted.
 //!
-//! A stage has a list of [`Maintenance`] operations; after every step those that are due run, in the order of [`RunOrder`]. An
-//! operation changes rows only through [`TrainState::apply`], so it works for every motion model, and losses are notified.
-//! A new one is a file here and its entries in `operations!`: its table of settings, and how it is made of it.
+//! A stage has a list of [`Maintenance`] operations; after every step those that are due run, in the order of
+//! [`RunOrder`]. An operation changes rows only through [`TrainState::apply`], so it works for every motion model, and
+//! losses are notified. A new one is a file here and its entries in `operations!`: its table of settings, and how it is
+//! made of it.
 
-/// The list of operations. The recipe, and the settings that every motion model is trained with, get their tables from it.
+/// The list of operations. The recipe, and the settings that every motion model is trained with, get their tables from
+/// it.
 macro_rules! operations {
     // Tables of settings, between those before and after in the recipe.
     (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
@@ -124,7 +126,7 @@ impl Every {
     /// At no step.
     pub(crate) const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
 
-    /// Whether it is time after so many steps.
+    /// Whether it is time after this many steps.
     pub(crate) fn is_due(&self, step: usize) -> bool {
         self.interval > 0 && step >= self.first && step <= self.last && step.is_multiple_of(self.interval)
     }
@@ -160,10 +162,10 @@ impl std::ops::AddAssign for Change {
     }
 }
 
-/// All that an operation may know in addition to the learner.
+/// Inputs of an operation next to the learner.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
-    /// Where in the stage.
+    /// Position in the stage.
     pub at: At,
     /// Steps of the run that were done before this one: it addresses the random numbers.
     pub iteration: usize,
@@ -173,7 +175,7 @@ pub struct Context<'a> {
     pub limits: Limits,
     /// The frames that the scene is compared with.
     pub frames: &'a dyn Frames,
-    /// As the scene is drawn.
+    /// As the scene is rendered.
     pub antialias: Antialias,
     /// Whether a column group of a layer learns in this stage.
     pub learns: &'a dyn Fn(usize, &str) -> bool,
@@ -186,13 +188,13 @@ impl Context<'_> {
     }
 }
 
-/// The order in which operations of one step run, whatever the order in which they were added; those of one place run in
-/// that one.
+/// The order in which operations of one step run, whatever the order in which they were added; those of one place run
+/// in that one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RunOrder {
     /// Nodes, while statistics of the Gaussians that follow them are still there.
     Nodes,
-    /// Gaussians are put where images want them; before densification, which begins the statistics again.
+    /// Gaussians are put where images need them; before densification, which begins the statistics again.
     Place,
     /// The cloud grows.
     Grow,
@@ -200,7 +202,7 @@ pub enum RunOrder {
     Sort,
     /// Removal of what has little importance.
     Remove,
-    /// Merging of what stands in one place.
+    /// Merging of what is in one place.
     Merge,
     /// Numbers are set back.
     Reset,
@@ -210,7 +212,7 @@ pub enum RunOrder {
 
 /// Something that is done to a learner between steps.
 ///
-/// `run` takes `&mut self`: what an operation remembers from time to time is its own, and goes into checkpoints by
+/// `run` takes `&mut self`: an operation's state between calls is its own, and is saved in checkpoints by
 /// [`state`](Self::state).
 pub trait Maintenance: Send + Sync {
     /// Its name, which is its own among the operations of a stage that remember anything: checkpoints use it.
@@ -221,7 +223,8 @@ pub trait Maintenance: Send + Sync {
         RunOrder::Last
     }
 
-    /// Whether it is to run after so many steps of the stage; see [`once`](Self::once) for the time before the first one.
+    /// Whether it is to run after this many steps of the stage; see [`once`](Self::once) for the time before the first
+    /// one.
     fn due(&self, at: &At) -> bool;
 
     /// Does it.
@@ -233,20 +236,20 @@ pub trait Maintenance: Send + Sync {
         false
     }
 
-    /// The schedule of densification, where it follows that one: it goes on over the parts of a stage that is divided.
-    /// All other operations state their steps in the stage's own.
+    /// The schedule of densification, where it follows that one: it continues over the parts of a stage that is
+    /// divided. All other operations state their steps in the stage's own.
     fn densification(&mut self) -> Option<&mut Every> {
         None
     }
 
     /// About how many Gaussians there are after a place in the stage, of `count` and at most `cap`: what an estimate of
-    /// time goes by.
+    /// time passes.
     fn grown(&self, _at: &At, count: f64, _cap: f64) -> f64 {
         count
     }
 
-    /// Whether it belongs into a stage that only tunes a trained scene: it keeps up what the model needs, and adds, moves
-    /// and removes no Gaussian.
+    /// Whether it belongs into a stage that only tunes a trained scene: it keeps up what the model needs, and adds,
+    /// moves and removes no Gaussian.
     fn in_tuning(&self) -> bool {
         false
     }
@@ -256,12 +259,12 @@ pub trait Maintenance: Send + Sync {
         Vec::new()
     }
 
-    /// Takes back what [`state`](Self::state) gave; nothing from a checkpoint that does not know the operation.
+    /// Restores the result of [`state`](Self::state); empty from a checkpoint without the operation.
     fn restore(&mut self, _state: &[u32]) {}
 }
 
-/// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those
-/// it adds) and its random numbers. Statistics begin again.
+/// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by
+/// those it adds) and its random numbers. Statistics begin again.
 fn grow(
     train_state: &mut TrainState,
     c: &Context<'_>,
@@ -304,8 +307,8 @@ fn logit(o: f64) -> f32 {
     math::logit(o, MARGIN) as f32
 }
 
-/// Whether nothing of the row can ever be seen, or would only do harm: dead opacity, a life outside the clip, a row that
-/// is not finite or a zero quaternion.
+/// Whether nothing of the row can ever be seen, or would only do harm: dead opacity, a lifespan outside the clip, a row
+/// that is not finite or a zero quaternion.
 fn is_dead(scene: &Scene<f32>, layer: usize, row: usize, min_opacity: f64, span: [f64; 2]) -> bool {
     let g = scene.layers[layer].params[GEOMETRY].read::<11>(row, 0);
     let quat: f32 = (QUAT..QUAT + 4).map(|i| g[i] * g[i]).sum();

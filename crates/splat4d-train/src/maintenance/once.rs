@@ -1,13 +1,13 @@
-//! Once: a change of the scene in the middle of a stage, whose schedules go on: a filter that is switched on, a model that
-//! becomes another.
+//! Once: a change of the scene in the middle of a stage, whose schedules continue: a filter that is switched on, a
+//! model that becomes another.
 
 use super::{At, Change, Context, Maintenance};
 use crate::Result;
 use crate::train_state::TrainState;
 use splat4d::layers::Scene;
 
-/// A change of the scene before one step of a stage. Done twice it must be as if it had been done once: it is repeated
-/// where a run is resumed at that very step.
+/// A change of the scene before one step of a stage. It must be idempotent: it is repeated where a run is resumed at
+/// that very step.
 pub(crate) struct Once<C> {
     /// The number of the step, from 0.
     pub at: usize,

@@ -1,5 +1,5 @@
-//! Opacity reset: every so many steps all opacities are lowered, so that what the images do not ask for stays faint and
-//! is pruned. Source: Kerbl et al. 2023 §5.2.
+//! Opacity reset: every n steps all opacities are lowered, so that Gaussians that images do not need stay faint and are
+//! pruned. Source: Kerbl et al. 2023 §5.2.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, Strategy, logit};
 use crate::Result;
@@ -8,7 +8,7 @@ use crate::train_state::TrainState;
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::OPACITY;
 
-/// Opacities are lowered to so many times the dead one (Kerbl et al. 2023: 0.01 where 0.005 is dead).
+/// Opacities are lowered to this many times the dead one (Kerbl et al. 2023: 0.01 where 0.005 is dead).
 const ABOVE_DEAD: f64 = 2.0;
 
 settings! {

@@ -48,7 +48,7 @@ impl Prune {
         (settings.interval > 0).then_some(Self { settings })
     }
 
-    /// The scores that it goes by.
+    /// The scores that it uses.
     fn scores(&self, train_state: &TrainState, c: &Context<'_>) -> Result<Scores> {
         let PruneSettings { views, spatial, .. } = self.settings;
         let every = c.frames.len().div_ceil(views.max(1)).max(1);

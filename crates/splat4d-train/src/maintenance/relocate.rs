@@ -1,8 +1,7 @@
-//! Periodic relocation, next to any strategy: the faintest Gaussians go where the image still wants to change, a few
-//! at a
-//! time, so that none is wasted, also after densification has ended.
+//! Periodic relocation, next to any strategy: the faintest Gaussians are moved to where the image still changes, a few
+//! at a time, so that none is wasted, also after densification has ended.
 //!
-//! Source: Wang et al. 2025 (FreeTimeGS) §3.3: every 100 steps, below a threshold of opacity, to places drawn from ½
+//! Source: Wang et al. 2025 (FreeTimeGS) §3.3: every 100 steps, below a threshold of opacity, to positions drawn from ½
 //! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).
 
 use super::mcmc::{Places, join};
@@ -129,12 +128,12 @@ mod tests {
         let g = &mut s.layers[0].params[GEOMETRY];
         for r in 0..200 {
             g.write(r, LOG_SCALE, [-1.5f32; 3]);
-            // Those that go are below what is drawn at all, so that only the arrival could be seen.
+            // Relocated ones are fainter than what is rendered, so that only their arrival could be visible.
             g.set(r, OPACITY, if r < 30 { -6.0 - 0.1 * r as f32 } else { -1.0 });
         }
         let before = picture(&s);
         let mut train_state = TrainState::new(s);
-        // Row 150 alone has a gradient: half of all draws are its.
+        // Row 150 alone has a gradient: half of all samples are its.
         train_state.stats_mut().tables[0].write(150, 0, [1.0, 1.0, 3.0]);
         let limits = Limits { cap: 300, extent: 4.0, min_opacity: 0.005 };
         let mut relocate = RELOCATE;

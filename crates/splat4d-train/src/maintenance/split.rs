@@ -13,9 +13,9 @@ use splat4d::scene::splats::COV;
 use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
 use std::sync::Arc;
 
-/// Times at which rows are looked at, evenly over the clip: an odd number has the middle.
-const LOOKS: usize = 17;
-/// A row whose life falls below this share anywhere in the clip comes or goes, and is not still.
+/// Times at which rows are examined, evenly over the clip: an odd number has the middle.
+const TIMES: usize = 17;
+/// A row whose lifespan falls below this share anywhere in the clip appears or vanishes, and is not static.
 const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
 const SAME_SHAPE: f64 = 0.05;
@@ -46,7 +46,7 @@ pub(crate) struct Split {
 }
 
 impl Split {
-    /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
+    /// The setting of a recipe for a last stage of `steps`, in which Gaussians move; `None`: never.
     pub(crate) fn of(settings: SplitSettings, extent: f64, steps: usize) -> Option<Self> {
         let some = || Self { at: (steps as f64 * settings.from) as usize, reach: settings.reach * extent };
         (settings.reach > 0.0).then(some)
@@ -72,8 +72,8 @@ impl Maintenance for Split {
     }
 }
 
-/// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a
-/// still layer behind the others; returns how many. A scene whose rows all move is left as it is.
+/// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose lifespan lasts,
+/// into a still layer behind the others; returns how many. A scene whose rows all move is not changed.
 pub(crate) fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
     let mut moved = 0;
     for index in 0..scene.layers.len() {
@@ -104,9 +104,9 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
     let n = layer.params.len();
     let mut still = vec![layer.span == ALWAYS && layer.masks.is_none(); n];
     let times: Vec<Time> =
-        (0..LOOKS).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (LOOKS - 1) as f64)).collect();
+        (0..TIMES).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (TIMES - 1) as f64)).collect();
     let look = |t: Time| Evaluation::of_layer(layer, Space::Gaussians, Rows::All, t);
-    let middle = look(times[LOOKS / 2]);
+    let middle = look(times[TIMES / 2]);
     let (kind, lives) = layer.lives();
     for t in times {
         let now = look(t);

@@ -59,7 +59,7 @@ pub(crate) fn due_steps(operation: &dyn Maintenance, steps: usize) -> Vec<usize>
 }
 
 #[test]
-fn schedules_are_due_at_multiples_and_go_on_over_the_parts_of_a_stage() {
+fn schedules_are_due_at_multiples_and_continue_over_the_parts_of_a_stage() {
     let every = Every { first: 20, last: 100, interval: 10 };
     let due = |e: Every, steps: usize| (1..=steps).filter(|&s| e.is_due(s)).collect::<Vec<_>>();
     assert_eq!(due(every, 200), [20, 30, 40, 50, 60, 70, 80, 90, 100]);

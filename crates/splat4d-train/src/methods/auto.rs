@@ -1,4 +1,4 @@
-//! `--motion auto`: looks at the capture, and takes the first program that states why it suits.
+//! `--motion auto`: examines the capture and selects the first program that states why it suits.
 
 use super::{Method, TrainContext};
 use crate::Result;
@@ -7,7 +7,7 @@ use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
 /// Cameras of the rig that are examined, and pairs of neighbouring frames of each.
-const LOOKS: (usize, usize) = (4, 8);
+const SAMPLED: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
@@ -23,8 +23,8 @@ pub struct CaptureStats {
     pub cameras: f64,
     /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where undetermined.
     pub changing: Option<f64>,
-    /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
-    /// matches.
+    /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too
+    /// little matches.
     pub agreement: Option<Agreement>,
     /// Fewest images of fixed cameras at a time.
     pub fewest: usize,
@@ -37,7 +37,7 @@ pub struct CaptureStats {
 }
 
 impl CaptureStats {
-    /// Looks at the training frames of a capture.
+    /// Examines the training frames of a capture.
     pub(crate) fn of(plan: &TrainContext, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
         Ok(Self {
@@ -94,11 +94,11 @@ fn motion_energy(frames: &dyn Frames) -> Result<Option<f64>> {
     for rig in &mut rigs {
         rig.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0));
     }
-    let step = rigs.len().div_ceil(LOOKS.0).max(1);
+    let step = rigs.len().div_ceil(SAMPLED.0).max(1);
     let (mut changed, mut pixels) = (0usize, 0usize);
     let mut pair = [Picture::default(), Picture::default()];
     for rig in rigs.iter().step_by(step) {
-        let stride = (rig.len() - 1).div_ceil(LOOKS.1).max(1);
+        let stride = (rig.len() - 1).div_ceil(SAMPLED.1).max(1);
         for n in (0..rig.len() - 1).step_by(stride) {
             for (picture, &i) in pair.iter_mut().zip(&rig[n..n + 2]) {
                 frames.load(i, picture)?;
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn the_capture_decides_and_the_reason_names_what_was_seen() {
+    fn auto_selects_by_the_capture_and_states_its_reason() {
         let is = |made: Made, fixed: bool, motion: &str, word: &str| {
             let choice = made.choose(fixed);
             assert!(choice.motion == motion && choice.why.contains(word), "{choice:?}");
@@ -218,7 +218,7 @@ mod tests {
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
-        // What is to go on needs Gaussians that last, where cameras can follow them.
+        // What is to continue needs Gaussians that last, where cameras can follow them.
         is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "prediction");
         is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "control", "2.0 cameras");
         is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");

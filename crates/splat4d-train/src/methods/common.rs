@@ -37,8 +37,8 @@ settings! {
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
-        // Colours, scales and rotations learn two to five times as fast as in Kerbl et al. 2023, whose runs have 30,000 steps; chosen
-        // on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
+        // Colours, scales and rotations learn two to five times as fast as in Kerbl et al. 2023, whose runs have 30,000
+        // steps; chosen on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
         /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
         settle: f64 = 0.15 => share();
         /// Rate of base colour; higher SH degrees learn 5 times more slowly.
@@ -61,7 +61,7 @@ const FASTEST: f64 = 1e-3;
 const FINEST: f64 = 0.08;
 
 impl RateSettings {
-    /// A rate that falls to `decay` of itself over the stage.
+    /// A rate that decays by the factor `decay` over the stage.
     pub(crate) fn falling(&self, rate: f64) -> Rate {
         Rate { start: rate, end: rate * self.decay }
     }
@@ -106,7 +106,8 @@ impl Choice for Option<LifeKind> {
 macro_rules! common_settings {
     ($($table:ident: $settings:ty,)*) => {
         /// The tables of settings that every motion model is trained with, resolved;
-        /// [`still::stage`](super::still::stage) makes a stage of them. What one model alone needs is its method's own.
+        /// [`still::stage`](super::still::stage) makes a stage of them. Settings of a single model belong to its
+        /// method.
         #[derive(Clone, Debug, Default, PartialEq)]
         pub struct CommonSettings {
             /// Colours of Gaussians and cameras.

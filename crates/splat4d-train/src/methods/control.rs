@@ -1,6 +1,6 @@
-//! `control`: one joint stage. SC-GS learns for 80,000 steps in stages (a still cloud, then the nodes as Gaussians of their
-//! own, then Gaussians on nodes); in a run of minutes the half-size images of the first steps do what those stages are
-//! for, and nodes start at farthest points of the initial cloud.
+//! `control`: one joint stage. SC-GS learns for 80,000 steps in stages (a still cloud, then the nodes as Gaussians of
+//! their own, then Gaussians on nodes); in a run of minutes the half-size images of the first steps do what those
+//! stages are for, and nodes start at farthest points of the initial cloud.
 
 pub(crate) mod losses;
 
@@ -14,18 +14,18 @@ use splat4d::motion::Spec;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{MAX_NEIGHBOURS, MAX_NODES, SkinSpec};
 
-/// One key of a trajectory about every so many frames. Four is usual for B-splines on SE(3); with one moving camera fewer
+/// One key of a trajectory about every n frames. Four is usual for B-splines on SE(3); with one moving camera fewer
 /// keys separate motion from shape sooner: 12 keys reach 31.9 dB on D-NeRF's mutant after 1,000 steps, 41 keys 29.0 dB.
 const FRAMES_PER_KEY: usize = 12;
 /// A cubic curve has three keys more than segments.
 const CUBIC_EXTRA: usize = 3;
-/// Most keys that are chosen without being asked for: more than a minute of capture at one key in four frames.
+/// Most keys that are chosen without being requested: more than a minute of capture at one key in four frames.
 const MOST_KEYS: usize = 512;
 /// Levels of the encoding of node positions and of time (SC-GS: 10 and 6; nodes are few, so that fewer suffice).
 const LEVELS: (usize, usize) = (4, 6);
 
 choices! {
-    /// What drives control nodes.
+    /// Trajectories of control nodes.
     pub enum Trajectory {
         /// Cubic B-splines on SE(3).
         Spline = "spline",
@@ -129,7 +129,7 @@ impl Method for ControlMethod {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

@@ -9,24 +9,26 @@ use splat4d::motion::deform::{Deform, DeformSpec, Input};
 use splat4d::nn::HashShape;
 use splat4d::scene::Params;
 
-/// Hidden layers and width of the large trunk, and the layer behind which its input stands again (Yang et al. 2024).
+/// Hidden layers and width of the large trunk, and the layer after which its input is appended again (Yang et al.
+/// 2024).
 const LARGE: (usize, usize, usize) = (8, 256, 4);
-/// Levels of places with the large trunk, at least (Yang et al. 2024).
+/// Levels of positions with the large trunk, at least (Yang et al. 2024).
 const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
-/// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud that
-/// is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
+/// Canonical positions start with this share of the recipe's rate, which suits short-lived Gaussians: a cloud that is
+/// seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;
-/// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the gradient, and
-/// at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in one step. With
-/// it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
+/// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the
+/// gradient, and at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in
+/// one step. With it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
 pub(super) const WARM_UP: usize = 50;
 /// Short runs have no time for it: at most this part of the iterations.
 pub(super) const WARM_UP_SHARE: usize = 20;
-/// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
+/// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of
+/// samples.
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
 const TIME: HashShape = HashShape { levels: 6, features: 2, log2_size: 15, base: 4, finest: 128 };
@@ -95,7 +97,7 @@ impl Method for DeformMethod {
         check(plan, &self.deform)
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 
@@ -136,7 +138,7 @@ fn check(plan: &TrainContext, deform: &DeformSettings) -> Result<()> {
             .remedy("Train it with --motion still"));
     }
     Deform::new(spec(plan, deform), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
-        Error::input(format!("the network that the recipe asks for cannot be made: {e}"))
+        Error::input(format!("the recipe's network is invalid: {e}"))
             .remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels")
     })
 }
@@ -144,8 +146,9 @@ fn check(plan: &TrainContext, deform: &DeformSettings) -> Result<()> {
 fn spec(plan: &TrainContext, deform: &DeformSettings) -> DeformSpec {
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: deform.t_levels, time_net: deform.time_net };
     let trunk = match deform.trunk {
-        // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
-        // (docs/suite.md). Of one object alone, seen once a time, the network generalises better (docs/models.md).
+        // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB
+        // less (docs/suite.md). Of one object alone, seen once per time, the network generalises better
+        // (docs/models.md).
         Trunk::Auto if plan.masks && plan.fixed_cameras == 0 => Trunk::Small,
         Trunk::Auto => Trunk::Hash,
         chosen => chosen,
@@ -190,7 +193,7 @@ fn learns(learns: bool) -> super::Hook {
 }
 
 fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()> {
-    // The names are those of a model of this spec, wherever its tables lie.
+    // The names are those of a model of this spec, wherever its tables are.
     for column in Deform::new(spec.clone(), &mut Params::<f32>::new(0, 1, &[]))?.network_columns() {
         if let Some(key) = p.find(&column) {
             p.info_mut(key).trainable = learns;

@@ -1,9 +1,9 @@
 //! `filtered`: any program with a temporal filter around its model, and the transport losses on any model.
 //!
-//! The inner program's stages stay as they are; the filter is there from the start, switched off, and is switched on in
-//! the middle of whichever stage runs by then, so that no schedule notices. Hooks of the inner program see its own model:
-//! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe says
-//! otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
+//! The inner program's stages are not changed; the filter is there from the start, switched off, and is switched on in
+//! the middle of whichever stage runs then, so that no schedule notices. Hooks of the inner program see its own model:
+//! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe
+//! states otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
 
 use super::{Group, Hook, InitialMotion, Method, Stage, TrainContext};
 use crate::Result;
@@ -56,7 +56,7 @@ impl Choice for Predictor {
     const NAMES: &'static [(&'static str, Self)] = &Self::ALL;
 }
 
-/// The program with a filter and transport losses around it; as it is where both are off.
+/// The program with a filter and transport losses around it; unchanged if both are off.
 pub(crate) fn wrap(inner: Box<dyn Method>, filter: &FilterSettings, transport: &TransportSettings) -> Box<dyn Method> {
     if filter.fusion == Fusion::Off && transport.metric.is_none() {
         return inner;
@@ -106,13 +106,13 @@ impl Method for FilteredMethod {
         let off_early = filter.until < 1.0;
         if filter.fusion != Fusion::Off && off_early && (filter.until <= filter.start || filter.keep) {
             return Err(crate::Error::input(format!("the filter is taken off at filter.until={}", filter.until))
-                .remedy("Let filter.start be less, and do not ask for filter.keep"));
+                .remedy("Lower filter.start, and leave filter.keep out"));
         }
         self.inner.check(plan)
     }
 
-    fn one_moment(&self, plan: &TrainContext) -> bool {
-        self.inner.one_moment(plan)
+    fn one_time(&self, plan: &TrainContext) -> bool {
+        self.inner.one_time(plan)
     }
 
     fn first(&self, plan: &TrainContext) -> TrainContext {
@@ -176,7 +176,7 @@ impl Method for FilteredMethod {
     }
 }
 
-/// Switches the filter after a share of all steps, in the stage that runs by then.
+/// Switches the filter after a share of all steps, in the stage that runs then.
 fn switch(stages: &mut [Stage], share: f64, fusion: Fusion) {
     let total: usize = stages.iter().map(|s| s.iterations).sum();
     let mut left = (share * total as f64).round() as usize;

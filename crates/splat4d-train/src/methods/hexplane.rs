@@ -1,8 +1,8 @@
-//! `hexplane`: how it is learnt. A coarse stage in which nothing moves, then a fine one in which planes and networks learn
-//! with the canonical cloud. The box of the planes is that of the cloud when the fine stage begins.
+//! `hexplane`: how it is learnt. A coarse stage in which nothing moves, then a fine one in which planes and networks
+//! learn with the canonical cloud. The box of the planes is that of the cloud when the fine stage begins.
 //!
-//! The original multiplies every rate by the scene's extent. Here the networks see the box as [0, 1]³ and answer in half
-//! boxes, so the rates of planes and networks have no unit; the cloud's positions keep theirs.
+//! The original multiplies every rate by the scene's extent. Here the networks' inputs are in the box [0, 1]³ and their
+//! outputs in half boxes, so the rates of planes and networks have no unit; the cloud's positions keep theirs.
 //! Source: Wu et al. 2024 ("4DGaussians") §4 and the released configurations.
 
 use super::{Group, Hook, Method, Rate, Stage, TrainContext, still};
@@ -77,13 +77,13 @@ pub(crate) struct HexplaneMethod {
 const FRAMES_PER_STEP: usize = 4;
 /// Fewest time steps, for short clips.
 const LEAST_STEPS: usize = 8;
-/// Share of the Gaussians that may lie outside the box on each side of an axis: strays must not coarsen the planes.
+/// Share of the Gaussians that may be outside the box on each side of an axis: strays must not coarsen the planes.
 const OUTSIDE: f64 = 0.002;
-/// The box is this much larger on every side than the cloud, of its longest side: things move.
+/// The box is this much larger on every side than the cloud, of its longest side, because objects move.
 const MARGIN: f64 = 0.1;
 /// Smallest side of the box, of its longest: a flat cloud may still move out of its plane.
 const FLATTEST: f64 = 0.1;
-/// One of so many steps has a coarse stage's place if the recipe leaves it open.
+/// The coarse stage takes one of this many steps if the recipe leaves it open.
 const COARSE_PART: usize = 10;
 
 impl Method for HexplaneMethod {
@@ -91,7 +91,7 @@ impl Method for HexplaneMethod {
         Spec::Hexplane(self.spec_of(plan))
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 
@@ -176,7 +176,7 @@ impl HexplaneMethod {
         ends
     }
 
-    /// Everything in one stage, with so many levels; the others are parts of it.
+    /// Everything in one stage, with this many levels; the others are parts of it.
     fn whole(&self, plan: &TrainContext, levels: usize) -> Stage {
         let c = &plan.common;
         let mut stage = still::stage("hexplane", plan);

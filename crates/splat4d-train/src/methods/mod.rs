@@ -1,9 +1,10 @@
 //! How motion models are learned: one [`Method`] per model, which makes the list of [`Stage`]s that the trainer runs.
 //!
-//! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
+//! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a
+//! capture.
 
-/// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings and makes
-/// it from the recipe `r`. `auto` asks them in this order.
+/// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings
+/// and makes it from the recipe `r`. `auto` tries them in this order.
 macro_rules! methods {
     // Tables of settings, between those before and after in the recipe.
     (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
@@ -79,7 +80,7 @@ use splat4d::scene::{LifeKind, Params};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// The capture and the wishes of the user, as far as a program may know them.
+/// The capture and the user's settings, as far as programs may depend on them.
 #[derive(Clone, Debug, Default)]
 pub struct TrainContext {
     /// Settings that every motion model is trained with, resolved.
@@ -143,13 +144,13 @@ impl Rate {
     }
 }
 
-/// What is left of the rates at the end of a stage that settles.
+/// Remaining share of the rates at the end of a settling stage.
 const SETTLED: f64 = 0.1;
 
 /// A group of this layer is one of every layer that has its columns.
 pub(crate) const EVERY: usize = usize::MAX;
 
-/// A learnable group: one column group of one table. What no group names is frozen.
+/// A learnable group: one column group of one table. Columns without a group are frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
     /// The layer, or `EVERY`.
@@ -160,9 +161,9 @@ pub struct Group {
     pub part: Option<(usize, usize)>,
     /// How fast.
     pub rate: Rate,
-    /// Frozen for so many steps of the stage (networks and fine grids that come in later).
+    /// Frozen for this many steps of the stage (networks and fine grids that start later).
     pub from: usize,
-    /// The rate rises linearly over so many of its first steps; 0: all at once.
+    /// The rate rises linearly over this many of its first steps; 0: all at once.
     pub warm_up: usize,
 }
 
@@ -196,7 +197,7 @@ pub struct TimeNoise {
 }
 
 impl TimeNoise {
-    /// β after so many steps of the stage.
+    /// β after this many steps of the stage.
     pub(crate) fn width(&self, step: usize) -> f64 {
         if step >= self.steps { 0.0 } else { self.start * (1.0 - step as f64 / self.steps as f64) }
     }
@@ -220,8 +221,8 @@ pub struct Stage {
     pub groups: Vec<Group>,
     /// The part of the stage, in shares of it, over which all rates fall linearly to a tenth; empty: they do not.
     ///
-    /// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some tenths of a
-    /// decibel short of what it has learned; small rates from the start would learn less.
+    /// A step uses one image, and moves parameters towards that image alone. At full rates a run therefore ends some
+    /// tenths of a decibel short of what it has learned; small rates from the start would learn less.
     pub settling: Range<f64>,
     /// Losses over several times.
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
@@ -235,7 +236,7 @@ pub struct Stage {
     pub sh_interval: usize,
     /// Steps of earlier stages that count for it.
     pub sh_from: usize,
-    /// The first so many steps see images at half size: coarse things first, and four times faster.
+    /// The first steps, this many, use images at half size: coarse structure first, and four times faster.
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
@@ -243,11 +244,11 @@ pub struct Stage {
     pub time_noise: TimeNoise,
     /// Losses on images, after the run's own.
     pub pictures: Vec<Box<dyn ImageTerm>>,
-    /// Whether the cameras' exposures stay as they are.
+    /// Whether the cameras' exposures are frozen.
     pub freeze_exposure: bool,
     /// The codec between the parameters and the images; none: nothing.
     pub codec: Option<Arc<dyn Codec<f32>>>,
-    /// The phase in which it puts the models of all layers; none: as they are.
+    /// The phase that it sets for the models of all layers; none: unchanged.
     pub phase: Option<Phase>,
     /// Before the first step.
     pub start: Option<Hook>,
@@ -319,7 +320,7 @@ impl Stage {
         self
     }
 
-    /// The highest SH degree that is drawn after so many steps, of `most`.
+    /// The highest SH degree that is rendered after this many steps, of `most`.
     pub(crate) fn sh_degree(&self, step: usize, most: usize) -> usize {
         (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }
@@ -334,9 +335,9 @@ impl Stage {
 /// How a Gaussian begins, as far as its seed states it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitialMotion {
-    /// Centre and width of its life, seconds.
+    /// Centre and width of its lifespan, seconds.
     pub life: (f64, f64),
-    /// At the centre of its life, scene units a second.
+    /// At the centre of its lifespan, scene units per second.
     pub velocity: [f64; 3],
 }
 
@@ -344,38 +345,38 @@ pub struct InitialMotion {
 pub trait Method: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &TrainContext) -> Spec;
-    /// Makes it, and in `params` its tables: how a model from outside the library comes to be.
+    /// Constructs it, and its tables in `params`: the constructor of a model from outside the library.
     fn build(&self, plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         build(&self.spec(plan), params)
     }
-    /// The life its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that lasts
-    /// ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty before something
-    /// comes there (docs/models.md); a camera that moves sees every place at few times, and lives gain nothing. Others,
-    /// and those whose future is to be predicted, are there for ever.
+    /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
+    /// lasts ([`one_time`](Self::one_time)) may appear and vanish with fixed cameras, which see that a position is
+    /// empty before an object appears there (docs/models.md); a camera that moves sees every position at few times, and
+    /// lifespans gain nothing. Others, and those whose future is to be predicted, are there forever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
-        let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
+        let lasting = self.one_time(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
-    /// The plan of the initial points: the whole clip, or what of it is learnt first.
+    /// The plan of the initial points: the whole clip, or its part that is learnt first.
     fn first(&self, plan: &TrainContext) -> TrainContext {
         plan.clone()
     }
     /// Fills what the model's own tables start with, row by row.
     fn init(&self, _plan: &TrainContext, _beginnings: &[InitialMotion], _params: &mut Params) {}
-    /// Says before training, and not after an hour, that the model cannot work on a capture.
+    /// Reports before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &TrainContext) -> Result<()> {
         Ok(())
     }
-    /// Whether all Gaussians live through the whole clip, so that training should start from one time's cloud and not
-    /// from the clouds of many times together.
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    /// Whether all Gaussians are alive during the whole clip, so that training should start from one time's cloud and
+    /// not from the clouds of many times together.
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         false
     }
     /// Properties of the model.
     fn capabilities(&self, plan: &TrainContext) -> Capabilities {
         self.spec(plan).capabilities().unwrap_or_default()
     }
-    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is asked for.
+    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is requested.
     fn suits(&self, _seen: &CaptureStats) -> Option<String> {
         None
     }
@@ -429,7 +430,7 @@ pub(crate) fn tuning(program: &dyn Method, plan: &TrainContext) -> Stage {
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
     stage.time_noise = TimeNoise::default();
-    // What came in late in training is there by now.
+    // Parts that start late in training are enabled now.
     stage.groups.iter_mut().for_each(|g| (g.from, g.warm_up) = (0, 0));
     stage
 }

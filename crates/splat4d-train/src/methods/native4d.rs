@@ -1,7 +1,7 @@
 //! `native4d`: one stage; both quaternions, scales and times learn next to geometry and colour.
 //!
-//! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
-//! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
+//! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions
+//! changes the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
 use super::{Group, InitialMotion, Method, Rate, Stage, TrainContext, still};
 use crate::loss::scene::LivingOpacity;
@@ -11,7 +11,8 @@ use splat4d::motion::Spec;
 use splat4d::motion::native4d::{MAX_HARMONICS, Native4dSpec, TABLE, set_velocity};
 use splat4d::scene::{LifeKind, Params};
 
-/// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
+/// Scales in time count up to this many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's
+/// ends).
 const LONGEST_CLIPS: f64 = 10.0;
 
 settings! {
@@ -49,7 +50,7 @@ impl Method for Native4dMethod {
         })
     }
 
-    /// The life is in the model.
+    /// The lifespan is in the model.
     fn life(&self, _plan: &TrainContext) -> LifeKind {
         LifeKind::Infinite
     }

@@ -12,7 +12,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 /// A motion model of a caller's own, and how its tables are learnt.
 #[derive(Clone)]
 pub struct OwnMotion {
-    /// What recipes and files call it.
+    /// Its name in recipes and files.
     pub name: String,
     /// Makes the model, and in the parameters its tables (or claims the loaded ones). Its spec is `Spec::Custom(name)`.
     pub make: MakeMotion,
@@ -26,8 +26,8 @@ pub struct OwnMotion {
 static OWN: RwLock<BTreeMap<&'static str, Arc<OwnMotion>>> = RwLock::new(BTreeMap::new());
 
 impl OwnMotion {
-    /// Makes the model known to training and to every reader of scenes, for the rest of the process: `run.motion` may be its
-    /// name. A model of that name that was registered before is replaced.
+    /// Registers the model with training and every reader of scenes, for the rest of the process: `run.motion` may be
+    /// its name. A model of that name that was registered before is replaced.
     ///
     /// Errors: a name that is taken or cannot be written; a share outside [0, 1); rates that are not finite.
     pub fn register(self) -> Result<()> {
@@ -42,7 +42,7 @@ impl OwnMotion {
         }
         register_motion(&self.name, self.make.clone())?;
         let mut own = OWN.write().unwrap_or_else(PoisonError::into_inner);
-        // Names live as long as the process, as those of the library do.
+        // Names need a static lifetime, as those of the library.
         let name = own.get_key_value(self.name.as_str()).map(|(name, _)| *name);
         let name = name.unwrap_or_else(|| String::leak(self.name.clone()));
         own.insert(name, Arc::new(self));
@@ -58,7 +58,7 @@ pub(crate) fn name(name: &str) -> Option<&'static str> {
 /// The program of a model from outside.
 pub(crate) fn program(name: &str) -> Option<Box<dyn Method>> {
     let own = OWN.read().unwrap_or_else(PoisonError::into_inner).get(name).cloned()?;
-    assert!(is_registered(name), "a model that training knows is known to readers");
+    assert!(is_registered(name), "a model registered with training is registered with readers");
     Some(Box::new(OwnMethod(own)))
 }
 
@@ -95,7 +95,7 @@ impl Method for OwnMethod {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

@@ -1,5 +1,5 @@
-//! `spacetime`: one stage; velocities, lives, rotation rates and, where the recipe has them, features and their head learn
-//! next to geometry and colour.
+//! `spacetime`: one stage; velocities, lifespans, rotation rates and, if set in the recipe, features and their head
+//! learn next to geometry and colour.
 
 use super::auto::CaptureStats;
 use super::still;

@@ -1,6 +1,6 @@
-//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and maintenance it
-//! shares; before it,
-//! if the recipe says so, a still warm-up, after which nodes are placed again on what became of the cloud.
+//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and maintenance it shares;
+//! before it, if the recipe specifies it, a still warm-up, after which nodes are placed again on what became of the
+//! cloud.
 
 use super::{ControlSettings, Group, Hook, Method, Rate, Stage, TrainContext, control, still};
 use crate::maintenance::NodeSettings;
@@ -70,7 +70,7 @@ pub(crate) struct SsmMethod {
 const TIMES_PER_TICK: usize = 10;
 /// Ticks of a clip, where the recipe leaves the choice.
 const TICKS: std::ops::RangeInclusive<usize> = 16..=96;
-/// Gaussians less opaque than this hold no node: what is about to die says nothing of the shape.
+/// Gaussians less opaque than this hold no node: what is about to die carries no information of the shape.
 const SOLID_LOGIT: f32 = -2.2;
 
 impl Method for SsmMethod {
@@ -103,7 +103,7 @@ impl Method for SsmMethod {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

@@ -74,7 +74,7 @@ pub(crate) fn groups(c: &CommonSettings, extent: f64) -> Vec<Group> {
     groups
 }
 
-/// Lets a stage learn its Gaussians' lives: birth and death, for any model.
+/// Lets a stage learn its Gaussians' lifespans: birth and death, for any model.
 pub(crate) fn learn_life(stage: &mut Stage, plan: &TrainContext, life: LifeKind) {
     let c = &plan.common;
     if life != LifeKind::Infinite {
@@ -91,7 +91,7 @@ pub(crate) fn learn_life(stage: &mut Stage, plan: &TrainContext, life: LifeKind)
 pub fn stage(name: &str, plan: &TrainContext) -> Stage {
     let c = &plan.common;
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
-    // These two belong to MCMC: they make room; under ADC they only dim.
+    // These two belong to MCMC: they free Gaussians; under ADC they only dim.
     if c.densify.strategy == Strategy::Mcmc {
         if c.mcmc.opacity_reg > 0.0 {
             params.push(Box::new(MeanOpacity { weight: c.mcmc.opacity_reg }));

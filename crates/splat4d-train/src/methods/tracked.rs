@@ -1,8 +1,9 @@
-//! `tracked`: how it is learnt. Frame 0 as a still scene; then one stage a frame, in which only that frame's poses learn,
-//! from where the frames before say that everything goes on, tied to its neighbours.
+//! `tracked`: how it is learnt. Frame 0 as a still scene; then one stage a frame, in which only that frame's poses
+//! learn, starting from the extrapolation of the previous frames, tied to their neighbours.
 //!
-//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
-//! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
+//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not
+//! given; lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not depend
+//! on the unit.
 
 use super::auto::CaptureStats;
 use super::{Group, Hook, Method, Rate, Stage, TrainContext, still};
@@ -26,9 +27,9 @@ use std::sync::Arc;
 const NAME: &str = "tracked";
 /// The extent, in metres, of the rig that the paper's weights are for (CMU Panoptic Studio).
 const PAPER_EXTENT: f64 = 3.0;
-/// Share of the masks' weight that frame 0 has. No Gaussian is known to be foreground yet, and at full weight opacities fall to
-/// make up for it: 18.3 dB instead of 29.5 on frame 0 of the bundled capture after 800 steps. The logits, which see nothing
-/// but masks, learn as fast with any weight, since Adam does not know the scale of a gradient.
+/// Share of the masks' weight that frame 0 has. The foreground is not known yet, and at full weight opacities fall to
+/// make up for it: 18.3 dB instead of 29.5 on frame 0 of the bundled capture after 800 steps. The logits, which depend
+/// on masks alone, learn as fast with any weight, because Adam is invariant to the scale of a gradient.
 const FIRST_MASKS: f64 = 1e-3;
 
 settings! {
@@ -222,7 +223,7 @@ impl TrackedMethod {
     }
 }
 
-/// Adds frame k where everything goes on as it went.
+/// Adds frame k where everything continues as it went.
 fn next_frame(plan: &TrainContext, k: usize, velocity_cap: f64, tracking: &Tracking<f32>) -> Hook {
     let (t, cap) = (plan.moments[k].0, velocity_cap * plan.extent);
     let tracking = tracking.clone();
@@ -248,7 +249,7 @@ fn next_frame(plan: &TrainContext, k: usize, velocity_cap: f64, tracking: &Track
     })
 }
 
-/// Frame 0's quaternions get length 1, as the others have: what they differ in is then the turn alone.
+/// Frame 0's quaternions get length 1, as the others have: their difference is then only the rotation.
 fn unit_quaternions(layer: &mut Layer) {
     let geometry = &mut layer.params[GEOMETRY];
     for r in 0..geometry.rows() {

@@ -22,7 +22,7 @@ const EPSILON: f64 = 1e-15;
 
 type Lane<F> = [F; BLOCK];
 
-/// c₁ and c₂ by step count, up to the count from which both are 1 for good (some 1,700 in f32: 13 kB).
+/// c₁ and c₂ by step count, up to the count from which both are exactly 1 (some 1,700 in f32: 13 kB).
 pub(crate) fn corrections<F: Real>() -> Vec<[F; 2]> {
     let correction = |beta: f64, n: i32| F::of(1.0 / (1.0 - beta.powi(n)));
     // A row that has taken no step is not active; its entry is never used.
@@ -139,8 +139,8 @@ fn step_block<F: Real, const FULL: bool>(
     checked.iter().all(|x| *x == F::ZERO)
 }
 
-/// First moment, second moment and parameter after the step. All come and go by value: through references, LLVM would
-/// ask at run time whether they overlap.
+/// First moment, second moment and parameter after the step. All are passed by value: through references, LLVM would
+/// check at run time whether they overlap.
 #[inline(always)]
 fn step_lanes<F: Real>([m1, m2, p, d]: [Lane<F>; 4], rate: F, c1: &Lane<F>, c2: &Lane<F>) -> [Lane<F>; 3] {
     let (beta1, beta2, epsilon) = (F::of(BETA1), F::of(BETA2), F::of(EPSILON));
@@ -155,8 +155,8 @@ fn step_lanes<F: Real>([m1, m2, p, d]: [Lane<F>; 4], rate: F, c1: &Lane<F>, c2: 
     out
 }
 
-/// The step of one row [N values, N first moments, N second moments, steps], computed in f64; a gradient that is not finite leaves
-/// it as it was.
+/// The step of one row [N values, N first moments, N second moments, steps], computed in f64; a gradient that is not
+/// finite leaves it as it was.
 pub(crate) fn step_row<const N: usize>(table: &mut Table<f32>, row: usize, d: [f64; N], rates: [f64; N]) {
     if d.iter().any(|x| !x.is_finite()) {
         return;

@@ -70,7 +70,7 @@ impl<F: Real> Moments<F> {
         table
     }
 
-    /// Forgets the moments of pages for which `learns` (of one of their column groups) does not hold: a frame that was
+    /// Resets the moments of pages for which `learns` (of one of their column groups) does not hold: a frame that was
     /// tracked does not learn again.
     pub(crate) fn forget_pages(&mut self, p: &Params<F>, learns: impl Fn(&str) -> bool) {
         for key in p.keys().filter(|&k| p.info(k).page.is_some()) {
@@ -87,7 +87,7 @@ impl<F: Real> Moments<F> {
         self.tables.iter().map(|t| size_of_val(t.data())).sum()
     }
 
-    /// Takes over the tables of `old` that have the same shape and stand at the same key; the rest stays new.
+    /// Takes over the tables of `old` that have the same shape and the same key; the rest stays new.
     pub(crate) fn adopt(&mut self, old: Self) {
         for ((table, &rows), old) in self.tables.iter_mut().zip(&self.rows).zip(old.tables) {
             // A page without history has nothing to give, whatever its rows.
@@ -97,8 +97,7 @@ impl<F: Real> Moments<F> {
         }
     }
 
-    /// Follows a row edit of `p` (which may stand before or after its own gather): rows that are not `Kept` start
-    /// again.
+    /// Follows a row edit of `p` (which may be before or after its own gather): rows that are not `Kept` start again.
     pub(crate) fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
         for key in p.keys().filter(|&k| p.info(k).space == edit.space) {
             let table = &mut self.tables[key.0 as usize];
@@ -117,9 +116,9 @@ impl<F: Real> Moments<F> {
 
     /// One step. `rates[key]` holds a rate a column (0: frozen); a key without an entry rests.
     ///
-    /// Gradients of the tables that learn are zero afterwards; what rests is left to [`Grads::clear`]. Returns the tables
-    /// in which a number was not finite: their parameters are then not to be used, and the gradient of the rows to blame
-    /// is kept.
+    /// Gradients of the tables that learn are zero afterwards; frozen ones are left to [`Grads::clear`]. Returns the
+    /// tables in which a number was not finite: their parameters are then not to be used, and the gradient of the rows
+    /// to blame is kept.
     pub fn step(
         &mut self,
         p: &mut Params<F>,

@@ -10,7 +10,8 @@ use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
 /// Opaque Gaussians get less than a ten-thousandth of the noise: too little for three normal numbers.
 const LEAST_GATE: f64 = 1e-4;
-/// Extent at which the published weights of 3DGS as MCMC hold as they are, scene units: that of NeRF's synthetic captures.
+/// Extent at which the published weights of 3DGS as MCMC apply unchanged, scene units: that of NeRF's synthetic
+/// captures.
 pub(crate) const MCMC_EXTENT: f64 = 4.4;
 /// Slope of the sigmoid that ends the noise above the dead opacity (Kheradmand et al. 2024).
 const NOISE_SLOPE: f64 = 100.0;
@@ -20,7 +21,7 @@ const NOISE_SLOPE: f64 = 100.0;
 pub struct Noise {
     /// Its strength, times the rate of positions.
     pub strength: f64,
-    /// Stages that begin after so many steps, where densification has ended, have none.
+    /// Stages that begin after this many steps, where densification has ended, have none.
     pub until: usize,
 }
 
@@ -38,13 +39,14 @@ impl Noise {
         (self.until > from).then_some(Self { until, ..self })
     }
 
-    /// The same as a device knows it that keeps a layer's tables; none: there is nothing to shake. `rng` is the layer's.
+    /// The same for a device that keeps a layer's tables; none: there is no noise to add. `rng` is the layer's.
     pub(crate) fn kept(&self, rate: f64, min_opacity: f64, rng: Rng) -> Option<ResidentNoise> {
         let (strength, limit) = (rate * self.strength, limit(min_opacity));
         (strength != 0.0).then_some(ResidentNoise { strength, dead: min_opacity, slope: NOISE_SLOPE, limit, rng })
     }
 
-    /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the step's.
+    /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the
+    /// step's.
     pub(crate) fn add(
         &self,
         scene: &mut Scene<f32>,

@@ -2,7 +2,7 @@
 
 use std::time::SystemTime;
 
-/// A time in UTC, to the second. Days to a date as Hinnant's `civil_from_days` has it (eras of 400 years from 1 March).
+/// A time in UTC, to the second. Days to a date by Hinnant's `civil_from_days` (eras of 400 years from 1 March).
 pub fn rfc3339(at: SystemTime) -> String {
     let seconds = at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let (days, clock) = (seconds / 86_400 + 719_468, seconds % 86_400);

@@ -1,4 +1,4 @@
-//! [`OutputFolder`]: the folder that a command writes, from the first look at it to the last file.
+//! [`OutputFolder`]: the folder that a command writes, from its first check to the last file.
 
 use super::cannot_write;
 use super::list::{self, List};
@@ -13,20 +13,20 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// File in the state that states what an unfinished command was asked for.
+/// File in the state folder with the request of an unfinished command.
 const ASKED: &str = "asked";
-/// Folder in the state with what a replaced run left, until the new one has begun: its files, its list, what it was asked for.
+/// Folder in the state folder for a replaced run until the new one has begun: its files, its list, its request.
 const ASIDE: &str = "aside";
 /// Folder in it with the files, where they were.
 const KEPT: &str = "kept";
 /// The same when the new run has begun: it is being deleted.
 const GONE: &str = "gone";
-/// Files that make a folder look like a run to people.
+/// Files by which people recognise a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// File of a finished run.
 const FINISHED: &str = "scene.safetensors";
 
-/// What of a folder must not be there already.
+/// Content that a folder must not have.
 #[derive(Clone, Copy)]
 pub enum Mixes<'a> {
     /// Anything.
@@ -40,27 +40,27 @@ pub enum Mixes<'a> {
     },
 }
 
-/// What a command asks of its folder.
+/// A command's request for its folder.
 #[derive(Clone, Copy)]
 pub struct Request<'a> {
     /// The command, for the record of the owner.
     pub command: &'a str,
-    /// What is read.
+    /// Inputs.
     pub inputs: &'a [Input<'a>],
     /// All that the result depends on, as text: the same text continues an unfinished command.
     pub asked: &'a str,
     /// Whether what splat4d wrote there before is to be replaced.
     pub force: bool,
-    /// What must not be there.
+    /// Content that must be absent.
     pub mixes: Mixes<'a>,
 }
 
-/// What there is of a command in its folder.
+/// State of a command in its folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FolderContent {
     /// Nothing: it begins.
     Nothing,
-    /// What the same command left when it ended early.
+    /// Output of the same command that ended early.
     Unfinished,
 }
 
@@ -69,7 +69,7 @@ pub enum FolderContent {
 pub struct OutputFolder {
     path: PathBuf,
     list: Arc<List>,
-    /// Whether what is there is to stay when this is dropped.
+    /// Whether the content is kept when this is dropped.
     begun: AtomicBool,
     /// Whether it was not there before.
     made: bool,
@@ -77,7 +77,7 @@ pub struct OutputFolder {
     owner: Option<Owner>,
 }
 
-/// What is to be done with a folder.
+/// Decision about a folder.
 enum Plan {
     Begin,
     Continue,
@@ -87,9 +87,9 @@ enum Plan {
 impl OutputFolder {
     /// Takes a folder for a command, and makes it where it is not there.
     ///
-    /// Errors: it equals, contains or is inside what is read; another process has it; it holds what would mix with the output
-    /// and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be written. Nothing
-    /// is changed then.
+    /// Errors: it equals, contains or is inside what is read; another process has it; its content would mix with the
+    /// output and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be
+    /// written. Nothing is changed then.
     pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, FolderContent)> {
         check_apart(path, request.inputs)?;
         if path.exists() && !path.is_dir() {
@@ -112,7 +112,7 @@ impl OutputFolder {
         recover(path)?;
         let plan = plan(path, request)?;
         if let (Plan::Begin, Mixes::Anything) = (&plan, request.mixes) {
-            // A list of files that are all gone: what comes under their names is not of then.
+            // A list of files that are all deleted: later files of these names are not ours.
             let _ = std::fs::remove_file(path.join(STATE).join(list::FILE));
         }
         let list = List::keep(path)?;
@@ -140,7 +140,8 @@ impl OutputFolder {
         Ok((folder, found))
     }
 
-    /// Takes a folder to add to it, and makes it where it is not there. Errors: another process has it; it cannot be written.
+    /// Takes a folder to add to it, and creates it if it is missing. Errors: another process has it; it cannot be
+    /// written.
     pub fn amend(path: &Path, command: &str) -> Result<Self> {
         let made = !path.exists();
         let owner = Owner::of(path, command)?;
@@ -160,12 +161,12 @@ impl OutputFolder {
         &self.path
     }
 
-    /// What the unfinished command in a folder was asked for.
-    pub fn asked(path: &Path) -> Option<String> {
+    /// Request of the unfinished command in a folder.
+    pub fn unfinished_request(path: &Path) -> Option<String> {
         crate::files::read_text(&path.join(STATE).join(ASKED)).ok()
     }
 
-    /// The new output has begun: what it replaces is deleted now, and what is there stays when the command fails.
+    /// The new output has begun: the replaced one is deleted now, and the new one is kept if the command fails.
     pub fn begun(&self) {
         if self.begun.swap(true, Ordering::Relaxed) {
             return;
@@ -217,7 +218,7 @@ impl OutputFolder {
         let _ = std::fs::remove_dir(&self.path);
     }
 
-    /// Moves what commands wrote before out of the way; of a sequence only its frames.
+    /// Moves earlier output aside; of a sequence only its frames.
     fn set_aside(&self, mixes: Mixes<'_>) -> Result<()> {
         if self.list.files().is_empty() {
             legacy::files(&self.path).iter().try_for_each(|f| self.list.add(f))?;
@@ -238,7 +239,7 @@ impl OutputFolder {
             moved.map_err(|e| cannot_write(&from, e))?;
             remove_empty(&self.path, &from);
         }
-        // The list last: as long as it is in its place, all of it is put back.
+        // The list is moved last: while it is in place, everything is restored.
         let state = self.path.join(STATE);
         for name in [ASKED, list::FILE] {
             match std::fs::rename(state.join(name), aside.join(name)) {
@@ -262,20 +263,20 @@ impl Drop for OutputFolder {
         }
         let state = self.path.join(STATE);
         if state.join(ASIDE).exists() {
-            // Which list is the new output's and which the old one's, `recover` knows.
+            // `recover` distinguishes the lists of the new and the old output.
             let _ = recover(&self.path);
             return;
         }
         let _ = clear(&self.path, &self.list);
         let _ = std::fs::remove_file(state.join(ASKED));
-        // Nothing of ours is left: the lock, which is still held, goes last.
+        // Nothing of ours is left: the lock, which is still held, is removed last.
         if let Some(owner) = self.owner.take() {
             self.give_back(owner);
         }
     }
 }
 
-/// What is to be done with a folder for a request. Errors: nothing can be.
+/// Decides about a folder for a request. Errors: nothing can be.
 fn plan(folder: &Path, request: &Request<'_>) -> Result<Plan> {
     let unreadable = |e| Error::io("cannot be read", e).at(folder.display());
     let mut there: Vec<OsString> = Vec::new();
@@ -331,7 +332,7 @@ fn plan_all(folder: &Path, request: &Request<'_>, there: &[OsString]) -> Result<
             }
         };
     }
-    if OutputFolder::asked(folder).is_some_and(|asked| asked == request.asked) {
+    if OutputFolder::unfinished_request(folder).is_some_and(|asked| asked == request.asked) {
         return Ok(Plan::Continue);
     }
     if there.is_empty() {
@@ -373,8 +374,8 @@ fn remove(folder: &Path, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Ends what a kill interrupted: deletes what was replaced, or, where the new output had not begun, removes that and puts back
-/// what was to be replaced. May itself be interrupted and called again.
+/// Ends what a kill interrupted: deletes what was replaced, or, where the new output had not begun, removes that and
+/// puts back what was to be replaced. May itself be interrupted and called again.
 fn recover(folder: &Path) -> Result<()> {
     let state = folder.join(STATE);
     let (aside, gone) = (state.join(ASIDE), state.join(GONE));
@@ -418,8 +419,8 @@ fn put_back(from: &Path, to: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Whether a listed path is a file, or a link itself, really below the folder: a folder that was replaced by a link leads
-/// elsewhere.
+/// Whether a listed path is a file, or a link itself, really below the folder: a folder that was replaced by a link
+/// leads elsewhere.
 fn is_own_file(folder: &Path, path: &Path) -> bool {
     let file = std::fs::symlink_metadata(path).is_ok_and(|m| !m.is_dir());
     let real = |p: &Path| p.canonicalize().ok();

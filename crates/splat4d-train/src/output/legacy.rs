@@ -134,7 +134,7 @@ fn is_file(path: &Path) -> bool {
     std::fs::symlink_metadata(path).is_ok_and(|m| m.is_file())
 }
 
-/// At least so many digits, then this ending.
+/// At least this many digits, then this ending.
 fn numbered(name: &str, digits: usize, ending: &str) -> bool {
     name.strip_suffix(ending).is_some_and(|n| n.len() >= digits && n.bytes().all(|b| b.is_ascii_digit()))
 }

@@ -1,7 +1,7 @@
 //! The list of the files that commands wrote into an output folder: `.splat4d/files`, a path a line, appended to.
 //!
-//! A file's line is written before the file gets its name, so that the list never misses one. Lines that end with a slash are
-//! folders in which files were written; half-written files are searched for there.
+//! A file's line is written before the file gets its name, so that the list never misses one. Lines that end with a
+//! slash are folders in which files were written; half-written files are searched for there.
 
 use super::{STATE, cannot_write, check_plain};
 use crate::Result;
@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, Weak};
 /// Name of the list in the folder's state.
 pub(super) const FILE: &str = "files";
 
-/// The folders that this process writes into and keeps lists of. Writers are many and know their file alone.
+/// The folders that this process writes into and keeps lists of. There are many writers, and each has only its file.
 static KEPT: Mutex<Vec<Weak<List>>> = Mutex::new(Vec::new());
 
 /// The list of one folder; new files in it are noted as long as this is there.
@@ -74,7 +74,7 @@ impl List {
         known.iter().filter(|p| !is_folder(p)).cloned().collect()
     }
 
-    /// Forgets all of it; its file is gone already.
+    /// Clears it; its file is already deleted.
     pub(super) fn forget(&self) {
         self.known.lock().unwrap_or_else(|e| e.into_inner()).clear();
     }
@@ -86,17 +86,18 @@ pub(super) fn folders(folder: &Path) -> Vec<PathBuf> {
     std::iter::once(folder.to_owned()).chain(listed.iter().filter(|p| is_folder(p)).map(|p| folder.join(p))).collect()
 }
 
-/// What commands wrote into a folder, by its list: paths below it, folders with a slash at their end.
+/// Files that commands wrote into a folder, by its list: paths below it, folders with a slash at their end.
 pub fn written(folder: &Path) -> BTreeSet<PathBuf> {
     read_of(folder)
 }
 
-/// What a folder's list names.
+/// Entries of a folder's list.
 pub(super) fn read_of(folder: &Path) -> BTreeSet<PathBuf> {
     read(&folder.join(STATE).join(FILE))
 }
 
-/// Notes a file that is about to get its name, if it is in a folder of which a list is kept. Errors: the list cannot be written.
+/// Notes a file that is about to get its name, if it is in a folder of which a list is kept. Errors: the list cannot be
+/// written.
 pub fn note(file: &Path) -> Result<()> {
     let Some((list, folder)) = kept(file) else { return Ok(()) };
     file.file_name().map_or(Ok(()), |name| list.add(&folder.join(name)))
@@ -116,7 +117,7 @@ pub(super) fn note_folder(file: &Path) -> Result<bool> {
     list.add(&folder.join("")).map(|()| true)
 }
 
-/// The innermost folder of which a list is kept and in which a file lies, and the file's folder in it.
+/// The innermost folder of which a list is kept and that contains a file, and the file's folder in it.
 fn kept(file: &Path) -> Option<(Arc<List>, PathBuf)> {
     let lists: Vec<Arc<List>> = {
         let kept = KEPT.lock().unwrap_or_else(|e| e.into_inner());

@@ -21,7 +21,7 @@ mod write;
 pub use date::rfc3339;
 pub use folder::{FolderContent, Mixes, OutputFolder, Request};
 pub use list::{note, written};
-pub use owner::{Owner, Standing, check_free};
+pub use owner::{Owner, OwnerRecord, check_free};
 pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};
 
@@ -30,7 +30,7 @@ use std::path::Path;
 
 /// Subfolder of an output folder with its lock, its owner and the list of its files.
 pub const STATE: &str = ".splat4d";
-/// What to do about a file that cannot be written.
+/// Remedy for an unwritable file.
 const NO_SPACE: &str = "Check that the folder exists, that you may write there and that the disk is not full";
 
 /// The error of a failed write.
@@ -38,7 +38,8 @@ fn cannot_write(path: &Path, error: std::io::Error) -> Error {
     Error::environment("cannot be written", error).at(path.display()).remedy(NO_SPACE)
 }
 
-/// Refuses a link, folder, pipe or device in the place of a file of an output folder's state: it would lead elsewhere, or wait.
+/// Refuses a link, folder, pipe or device in the place of a file of an output folder's state: it would lead elsewhere,
+/// or wait.
 fn check_plain(path: &Path) -> Result<()> {
     match std::fs::symlink_metadata(path) {
         Ok(there) if !there.is_file() => Err(Error::input("is not a regular file, but a link, folder, pipe or device")

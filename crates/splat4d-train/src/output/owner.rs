@@ -1,10 +1,10 @@
-//! Who writes into a folder: a lock of the operating system, and a record of the owner with a heartbeat.
+//! Owner of a folder: a lock of the operating system, and a record of the owner with a heartbeat.
 //!
-//! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither a
-//! reused process number nor a clock that was set plays a part. A lock that is free although the record names another
-//! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by the
-//! folder's own clock, and where that states "long ago" or "in the future" the record is watched for some beats before it is
-//! taken over: a clock that jumps makes no owner dead.
+//! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither
+//! a reused process number nor a clock that was set plays a part. A lock that is free although the record names another
+//! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by
+//! the folder's own clock, and where that states "long ago" or "in the future" the record is watched for some beats
+//! before it is taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
 use super::{STATE, cannot_write, check_plain, temporary};
@@ -23,17 +23,17 @@ const LOCK: &str = "lock";
 const RECORD: &str = "owner.json";
 /// Time between two heartbeats.
 const BEAT: Duration = Duration::from_secs(5);
-/// An owner on another machine whose heart has not beaten for so long is taken for dead: a dozen beats, so that a busy file
-/// server is not.
+/// An owner on another machine whose heart has not beaten for so long is taken for dead: a dozen beats, so that a busy
+/// file server is not.
 const DEAD: Duration = Duration::from_secs(60);
 /// So long a record is watched before it is taken over: three beats.
 const WATCH: Duration = Duration::from_secs(15);
-/// Time between two looks at a record that is watched, or at a lock that is waited for.
-const LOOK: Duration = Duration::from_millis(100);
+/// Interval between reads of a record that is watched, or at a lock that is waited for.
+const POLL: Duration = Duration::from_millis(100);
 
 /// The owner of a folder, as its record states it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Standing {
+pub struct OwnerRecord {
     /// The command, for instance `train`.
     pub command: String,
     /// Process number.
@@ -42,13 +42,13 @@ pub struct Standing {
     pub host: String,
     /// UTC.
     pub since: String,
-    /// An identifier of the machine as long as it runs; empty where the system does not say.
+    /// An identifier of the machine as long as it runs; empty where the system does not report it.
     machine: String,
-    /// Heartbeats so far, always as many digits, so that the record never changes its length.
+    /// Number of heartbeats, always with as many digits, so that the record never changes its length.
     beat: String,
 }
 
-impl Standing {
+impl OwnerRecord {
     fn new(command: &str) -> Self {
         Self {
             command: command.into(),
@@ -74,7 +74,7 @@ impl Standing {
     }
 }
 
-impl std::fmt::Display for Standing {
+impl std::fmt::Display for OwnerRecord {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "`splat4d {}`, process {} on {}, since {}", self.command, self.process, self.host, self.since)
     }
@@ -84,7 +84,7 @@ impl std::fmt::Display for Standing {
 #[derive(Debug)]
 pub struct Owner {
     record: PathBuf,
-    standing: Standing,
+    entry: OwnerRecord,
     /// Held, not read: closing it releases the lock.
     lock: Option<File>,
     done: Arc<(Mutex<bool>, Condvar)>,
@@ -99,10 +99,10 @@ pub(super) struct Patience {
 }
 
 impl Owner {
-    /// Makes the folder's state and takes the folder; the inner error is who has it; `None`: its record cannot be read.
+    /// Makes the folder's state and takes the folder; the inner error is its owner; `None`: its record cannot be read.
     ///
     /// Errors: the folder cannot be written.
-    pub(crate) fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<Standing>>> {
+    pub(crate) fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<OwnerRecord>>> {
         Self::with_patience(folder, command, Patience { dead: DEAD, watch: WATCH })
     }
 
@@ -110,7 +110,7 @@ impl Owner {
         folder: &Path,
         command: &str,
         patience: Patience,
-    ) -> Result<Result<Self, Option<Standing>>> {
+    ) -> Result<Result<Self, Option<OwnerRecord>>> {
         let state = folder.join(STATE);
         let fail = |e| cannot_write(folder, e);
         let record = state.join(RECORD);
@@ -127,21 +127,21 @@ impl Owner {
             match lock.try_lock() {
                 // A file system without locks: the heartbeat alone decides.
                 Ok(()) | Err(TryLockError::Error(_)) => {}
-                Err(TryLockError::WouldBlock) => return Ok(Err(Standing::read(&record))),
+                Err(TryLockError::WouldBlock) => return Ok(Err(OwnerRecord::read(&record))),
             }
             if is_at(&lock, &state.join(LOCK)) {
                 break lock;
             }
         };
-        let before = Standing::read(&record);
-        if let Some(before) = before.filter(|b| b.machine != machine() && lives(&state, &record, b, patience)) {
+        let before = OwnerRecord::read(&record);
+        if let Some(before) = before.filter(|b| b.machine != machine() && is_alive(&state, &record, b, patience)) {
             return Ok(Err(Some(before)));
         }
         // What a dead owner left half-written. Workers on parts of a folder have folders and locks of their own.
         temporary::remove_leftovers(folder);
-        let standing = Standing::new(command);
+        let entry = OwnerRecord::new(command);
         let opened = File::options().write(true).create(true).truncate(true).open(&record);
-        let written = opened.and_then(|mut file| file.write_all(&standing.bytes()).map(|()| file));
+        let written = opened.and_then(|mut file| file.write_all(&entry.bytes()).map(|()| file));
         let mut file = written.map_err(|e| {
             // A full disk: nothing stays of what was made for nothing.
             let _ = std::fs::remove_file(&record);
@@ -150,29 +150,30 @@ impl Owner {
         })?;
         let done = Arc::new((Mutex::new(false), Condvar::new()));
         let heart = std::thread::spawn({
-            let (standing, done) = (standing.clone(), done.clone());
-            move || pulse(&mut file, standing, &done)
+            let (entry, done) = (entry.clone(), done.clone());
+            move || pulse(&mut file, entry, &done)
         });
-        Ok(Ok(Self { record, standing, lock: Some(lock), done, heart: Some(heart) }))
+        Ok(Ok(Self { record, entry, lock: Some(lock), done, heart: Some(heart) }))
     }
 
-    /// The same; that another process has it is an error that states who.
+    /// The same; another owner is an error that names it.
     pub fn of(folder: &Path, command: &str) -> Result<Self> {
         Self::take(folder, command)?.map_err(|who| in_use(folder, who.as_ref()))
     }
 
-    /// Waits for the folder while `go_on` returns true for its owner. Errors: the folder cannot be written; it is in use.
-    pub fn wait(folder: &Path, command: &str, go_on: &mut dyn FnMut(Option<&Standing>) -> bool) -> Result<Self> {
+    /// Waits for the folder while `go_on` returns true for its owner. Errors: the folder cannot be written; it is in
+    /// use.
+    pub fn wait(folder: &Path, command: &str, go_on: &mut dyn FnMut(Option<&OwnerRecord>) -> bool) -> Result<Self> {
         loop {
             match Self::take(folder, command)? {
                 Ok(owner) => return Ok(owner),
-                Err(who) if go_on(who.as_ref()) => std::thread::sleep(LOOK),
+                Err(who) if go_on(who.as_ref()) => std::thread::sleep(POLL),
                 Err(who) => return Err(in_use(folder, who.as_ref())),
             }
         }
     }
 
-    /// Gives the folder back and removes all that states that it was ever owned: while the lock is held, so that no other process has it.
+    /// Releases the folder and removes all traces of ownership while the lock is held, so that no other process has it.
     pub(super) fn remove(mut self, folder: &Path) {
         self.rest();
         discard(&folder.join(STATE));
@@ -184,27 +185,27 @@ impl Owner {
         self.done.1.notify_all();
         let Some(heart) = self.heart.take() else { return };
         let _ = heart.join();
-        let own = |s: Standing| s.process == self.standing.process && s.machine == self.standing.machine;
-        if Standing::read(&self.record).is_some_and(own) {
+        let own = |s: OwnerRecord| s.process == self.entry.process && s.machine == self.entry.machine;
+        if OwnerRecord::read(&self.record).is_some_and(own) {
             let _ = std::fs::remove_file(&self.record);
         }
     }
 
-    /// Who has the folder now, without a trace in it; the inner `None`: an owner whose record cannot be read.
-    pub fn holder(folder: &Path) -> Option<Option<Standing>> {
+    /// Present owner of the folder, read without changing it; the inner `None`: an owner whose record cannot be read.
+    pub fn holder(folder: &Path) -> Option<Option<OwnerRecord>> {
         let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
         check_plain(&lock).ok()?;
         let lock = File::open(lock).ok()?;
         if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
-            return Some(Standing::read(&record));
+            return Some(OwnerRecord::read(&record));
         }
-        let other = Standing::read(&record).filter(|s| s.machine != machine())?;
+        let other = OwnerRecord::read(&record).filter(|s| s.machine != machine())?;
         age(&record, SystemTime::now()).is_some_and(|age| age <= DEAD).then_some(Some(other))
     }
 
     /// The same, if it is not this process.
-    pub fn other(folder: &Path) -> Option<Option<Standing>> {
-        Self::holder(folder).filter(|who| !who.as_ref().is_some_and(Standing::is_own))
+    pub fn other(folder: &Path) -> Option<Option<OwnerRecord>> {
+        Self::holder(folder).filter(|who| !who.as_ref().is_some_and(OwnerRecord::is_own))
     }
 }
 
@@ -227,7 +228,7 @@ pub fn check_free(file: &Path) -> Result<()> {
     Owner::other(folder).map_or(Ok(()), |who| Err(in_use(folder, who.as_ref())))
 }
 
-pub(super) fn in_use(folder: &Path, who: Option<&Standing>) -> Error {
+pub(super) fn in_use(folder: &Path, who: Option<&OwnerRecord>) -> Error {
     let who = who.map_or_else(|| "another process".to_owned(), ToString::to_string);
     Error::new(crate::ErrorKind::Io, format!("is in use by {who}"))
         .at(folder.display())
@@ -253,29 +254,29 @@ fn beat(count: u64) -> String {
 
 /// Beats until the owner is dropped. Written through the open file: if another process replaced the record, nothing of
 /// its own is touched. The time of the file is then that of the machine whose folder it is.
-fn pulse(file: &mut File, mut standing: Standing, (done, changed): &(Mutex<bool>, Condvar)) {
+fn pulse(file: &mut File, mut entry: OwnerRecord, (done, changed): &(Mutex<bool>, Condvar)) {
     let mut over = done.lock().unwrap_or_else(|e| e.into_inner());
     for count in 1u64.. {
         over = changed.wait_timeout_while(over, BEAT, |over| !*over).unwrap_or_else(|e| e.into_inner()).0;
         if *over {
             return;
         }
-        standing.beat = beat(count);
+        entry.beat = beat(count);
         // A beat that fails, on a full or read-only disk, is followed by others.
-        let _ = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&standing.bytes()));
+        let _ = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&entry.bytes()));
     }
 }
 
-/// Whether the owner of another machine, or of one that was restarted since, lives.
-fn lives(state: &Path, record: &Path, before: &Standing, patience: Patience) -> bool {
+/// Whether the owner on another machine, or on one that was restarted since, is running.
+fn is_alive(state: &Path, record: &Path, before: &OwnerRecord, patience: Patience) -> bool {
     let fresh = |age: Option<Duration>| age.is_some_and(|age| age <= patience.dead);
     if fresh(age(record, now(state))) {
         return true;
     }
     let began = Instant::now();
     while began.elapsed() < patience.watch {
-        match Standing::read(record) {
-            Some(now) if now.beat == before.beat && now.since == before.since => std::thread::sleep(LOOK),
+        match OwnerRecord::read(record) {
+            Some(now) if now.beat == before.beat && now.since == before.since => std::thread::sleep(POLL),
             // It ended in peace meanwhile.
             None if !record.exists() => return false,
             _ => return true,
@@ -319,11 +320,11 @@ mod tests {
 
     const QUICK: Patience = Patience { dead: Duration::from_millis(200), watch: Duration::from_millis(1000) };
 
-    fn elsewhere(folder: &Path, beat: &str) -> Standing {
+    fn elsewhere(folder: &Path, beat: &str) -> OwnerRecord {
         let state = folder.join(STATE);
         std::fs::create_dir_all(&state).unwrap();
-        let other = Standing { host: "elsewhere".into(), machine: "other".into(), ..Standing::new("train") };
-        let other = Standing { beat: beat.into(), ..other };
+        let other = OwnerRecord { host: "elsewhere".into(), machine: "other".into(), ..OwnerRecord::new("train") };
+        let other = OwnerRecord { beat: beat.into(), ..other };
         // Whole at any time, as a real owner's: one that is read empty is that of a killed process.
         std::fs::write(state.join("elsewhere.tmp"), other.bytes()).unwrap();
         std::fs::rename(state.join("elsewhere.tmp"), state.join(RECORD)).unwrap();
@@ -357,14 +358,14 @@ mod tests {
         let state = folder.path().join(STATE);
         std::fs::create_dir_all(&state).unwrap();
         for process in [u32::MAX, 1] {
-            let dead = Standing { process, ..Standing::new("train") };
+            let dead = OwnerRecord { process, ..OwnerRecord::new("train") };
             std::fs::write(state.join(RECORD), dead.bytes()).unwrap();
             let began = Instant::now();
             drop(Owner::of(folder.path(), "train").unwrap());
             assert!(began.elapsed() < WATCH, "nothing is watched");
         }
         // Half a record, as a kill may leave it.
-        std::fs::write(state.join(RECORD), &Standing::new("train").bytes()[..20]).unwrap();
+        std::fs::write(state.join(RECORD), &OwnerRecord::new("train").bytes()[..20]).unwrap();
         drop(Owner::of(folder.path(), "train").unwrap());
     }
 

@@ -1,7 +1,7 @@
-//! Where an output folder lies, compared with what is read.
+//! Position of an output folder relative to the inputs.
 //!
-//! Folders are compared by what the file system states they are (device and number), so that links, mounts, `..` and names
-//! that only differ in case are seen through.
+//! Folders are compared by what the file system states they are (device and number), so that links, mounts, `..` and
+//! names that only differ in case are seen through.
 
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 pub struct Input<'a> {
     /// Its path.
     pub path: &'a Path,
-    /// What it is, for errors: `the capture`.
+    /// Its name in errors: `the capture`.
     pub what: &'a str,
     /// Whether the output may be in it, as renders are in their run.
     pub may_hold: bool,
@@ -69,7 +69,7 @@ pub fn check_file(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     Ok(())
 }
 
-/// What the file system calls a file or folder.
+/// Identity of a file or folder in the file system.
 #[cfg(unix)]
 type Id = (u64, u64);
 #[cfg(not(unix))]

@@ -66,14 +66,14 @@ fn force_replaces_files_of_splat4d_and_keeps_user_files() {
         }
     };
 
-    // What fails before it has begun gives all of it back.
+    // A command that fails before it began restores everything.
     let (out, _) = OutputFolder::begin(&folder, &request("second", true)).unwrap();
     assert!(only_users(), "{:?}", tree(&folder).keys());
     write_all(&folder, &[("recipe.toml", "new"), ("cameras.json", "new")]);
     drop(out);
     assert_eq!(tree(&folder), before);
 
-    // What was killed before it had begun as well, at the next look.
+    // So does one that was killed before it began, at the next start.
     let (out, _) = OutputFolder::begin(&folder, &request("second", true)).unwrap();
     write_all(&folder, &[("recipe.toml", "new"), ("cameras.json", "new")]);
     let killed = work.path().join("killed");
@@ -87,7 +87,7 @@ fn force_replaces_files_of_splat4d_and_keeps_user_files() {
     drop(OutputFolder::amend(&killed, "eval").unwrap());
     assert_eq!(tree(&killed), before);
 
-    // What has begun stays, and what it replaced is gone.
+    // Output that has begun stays, and the replaced one is deleted.
     let (out, _) = OutputFolder::begin(&folder, &request("second", true)).unwrap();
     write_all(&folder, &[("recipe.toml", "new")]);
     out.begun();
@@ -230,7 +230,7 @@ fn a_partial_output_is_continued_by_the_same_command_only() {
     let (out, found) = begin("one").unwrap();
     assert_eq!(found, FolderContent::Unfinished);
     out.clear().unwrap();
-    assert!(tree(&folder).is_empty() && OutputFolder::asked(&folder).as_deref() == Some("one"));
+    assert!(tree(&folder).is_empty() && OutputFolder::unfinished_request(&folder).as_deref() == Some("one"));
     write_all(&folder, &[("recipe.toml", "")]);
     // While it runs no other process does anything.
     assert!(begin("one").unwrap_err().to_string().contains("in use by"));

@@ -15,8 +15,8 @@ pub struct Staged {
 }
 
 impl Staged {
-    /// Prepares to write `path`. A link is followed, so that the file behind it is replaced and not the link; a device or
-    /// a pipe is written to. In an output folder the link itself is replaced: folders come from other people.
+    /// Prepares to write `path`. A link is followed, so that the file behind it is replaced and not the link; a device
+    /// or a pipe is written to. In an output folder the link itself is replaced: folders may be from other people.
     ///
     /// Errors: a folder is there; the list of the folder's files cannot be written.
     pub fn new(path: &Path) -> Result<Self> {
@@ -45,7 +45,7 @@ impl Staged {
         Ok(Self { temporary: Some(temporary), target })
     }
 
-    /// Where to write now.
+    /// Current target of the write.
     pub fn path(&self) -> &Path {
         self.temporary.as_deref().unwrap_or(&self.target)
     }
@@ -69,8 +69,9 @@ impl Drop for Staged {
     }
 }
 
-/// Writes a file so that a crash leaves the old one or the new one, never half, and what is left is on the disk. Folders on
-/// the way are made. A device or a pipe is written to and never replaced. Errors: missing rights, no space.
+/// Writes a file so that a crash leaves the old one or the new one, never half, and the result is flushed to disk.
+/// Folders on the path are created. A device or a pipe is written to and never replaced. Errors: missing rights, no
+/// space.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     write_atomically_with(path, &mut |file| {
         file.write_all(bytes).map_err(|e| Error::environment("the file cannot be written", e).remedy(NO_SPACE))

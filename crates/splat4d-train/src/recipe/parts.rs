@@ -10,7 +10,7 @@ use splat4d::motion::{BUILT_IN, MODELS};
 /// Makes a program with the settings of a recipe.
 type Make = fn(&Recipe) -> Box<dyn Method>;
 
-/// The programs by the names of their models, in the order in which `auto` asks them.
+/// The programs by the names of their models, in the order in which `auto` tries them.
 pub(crate) const PROGRAMS: [(&str, Make); 8] = methods!(makers);
 
 impl Recipe {
@@ -43,7 +43,7 @@ impl Recipe {
             .remedy(format!("Use one of: {}", MODELS.join(", "))))
     }
 
-    /// All programs with the recipe's settings, in the order in which `auto` asks them.
+    /// All programs with the recipe's settings, in the order in which `auto` tries them.
     pub(crate) fn programs(&self) -> impl Iterator<Item = (&'static str, Box<dyn Method>)> + '_ {
         PROGRAMS.into_iter().map(|(name, make)| (name, make(self)))
     }

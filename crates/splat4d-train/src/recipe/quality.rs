@@ -6,7 +6,7 @@ use crate::{Error, Result};
 /// A quality: steps, Gaussians and size of images at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quality {
-    /// A look at whether a capture works: images of half the size, few steps, half as many Gaussians.
+    /// A quick check whether a capture works: images of half the size, few steps, half as many Gaussians.
     Draft,
     /// The default recipe.
     Standard,
@@ -21,8 +21,8 @@ const DRAFT_STEPS: usize = 2500;
 const DRAFT_COUNT: f64 = 0.5;
 /// Times that a draft's images are reduced, in addition to what the recipe does.
 const DRAFT_DOWNSCALE: usize = 2;
-/// Steps and the factor on the number of Gaussians of the best: basketball gains 1.5 dB by 20,000 and 60,000 over 8,000 and
-/// 30,000 (docs/benchmarks.md).
+/// Steps and the factor on the number of Gaussians of the best: basketball gains 1.5 dB by 20,000 and 60,000 over 8,000
+/// and 30,000 (docs/benchmarks.md).
 const BEST_STEPS: usize = 20_000;
 /// See [`BEST_STEPS`].
 const BEST_COUNT: f64 = 2.0;
@@ -54,8 +54,8 @@ impl std::str::FromStr for Quality {
 }
 
 impl Recipe {
-    /// This recipe with a quality's steps, number of Gaussians and image size. The number follows from the capture, whatever
-    /// the recipe states. Schedules that followed from the length follow from the new one.
+    /// This recipe with a quality's steps, number of Gaussians and image size. The number follows from the capture,
+    /// whatever the recipe states. Schedules that followed from the length follow from the new one.
     #[must_use]
     pub fn of_quality(&self, quality: Quality) -> Self {
         let standard = Self::default();

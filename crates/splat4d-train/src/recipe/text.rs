@@ -6,8 +6,8 @@ use crate::settings::{Setting, When, is_off, nearest};
 use crate::{Error, Result};
 
 impl Recipe {
-    /// Reads TOML: tables, or names without a table. Errors: syntax, an unknown key (with the nearest known one), a wrong
-    /// type or range.
+    /// Reads TOML: tables, or names without a table. Errors: syntax, an unknown key (with the nearest known one), a
+    /// wrong type or range.
     pub fn from_toml(text: &str) -> Result<Self> {
         let file: toml::Table = toml::from_str(text).map_err(|e| {
             Error::input(format!("the recipe is not valid TOML: {}", e.message()))
@@ -49,7 +49,7 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// Applies one `key=value`, as `--set` takes it. Strings need no quotes. Errors leave the recipe as it is.
+    /// Applies one `key=value`, as `--set` takes it. Strings need no quotes. Errors do not change the recipe.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let (key, text) = assignment.split_once('=').ok_or_else(|| {
             Error::input(format!("`{assignment}` is not of the form key=value"))
@@ -152,8 +152,8 @@ impl Recipe {
         Ok(())
     }
 
-    /// The recipe in the names and the order that it had before it had tables, byte for byte: what checkpoints know it by, so that
-    /// runs of then go on. Settings that came later count where they are not at their default.
+    /// The recipe in the names and the order that it had before it had tables, byte for byte: the identity that
+    /// checkpoints store so that old runs continue. Settings that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =
             FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();
@@ -166,7 +166,7 @@ impl Recipe {
         text
     }
 
-    /// The key of what stands in a table: its field, or a setting of it by its name without a table.
+    /// The key of what is in a table: its field, or a setting of it by its name without a table.
     fn inside(&self, table: &str, field: &str) -> String {
         let home = FLAT.iter().find(|(flat, key)| *flat == field && key.split('.').next() == Some(table));
         let key = format!("{table}.{field}");

@@ -1,8 +1,8 @@
-//! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while it
-//! goes, the machine may turn out to be slower or faster than then, and what is left is planned again.
+//! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while
+//! runs, the machine may be slower or faster than then, and the remaining steps are planned again.
 //!
 //! A new plan is one row of `run.replans` and depends on the clock; all else follows from the rows
-//! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or goes on with them gives the same bits.
+//! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or continues with them gives the same bits.
 
 use super::minutes::Timing;
 use crate::methods::Stage;
@@ -10,29 +10,30 @@ use crate::step::replans::ScheduleChange;
 use crate::step::trainer::{Position, Trainer};
 use serde::{Deserialize, Serialize};
 
-/// Looks at the clock in a whole run. A change of speed is seen within one of them and taken for lasting after some: what
-/// the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and faster).
-const LOOKS: f64 = 32.0;
+/// Clock readings in a whole run. A change of speed is detected within one interval and treated as lasting after some:
+/// what the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and
+/// faster).
+const READINGS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
-/// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
+/// Weight of the measurement since the last reading in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
-/// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the scene
-/// would be taken apart by rates and densifications meant for many.
+/// Steps of the schedule that a step may represent, and steps that may represent one of the schedule: with fewer the
+/// scene would be taken apart by rates and densifications meant for many.
 const MOST: usize = 8;
 /// Of the time, what is too late: more than `--minutes` promises.
 const LATE: f64 = 1.1;
 /// Of the time, the most that timing steps may take before the run.
 pub(super) const PROBES: f64 = 0.06;
 
-/// The time that a run may take. It stands in run.json, so that a resumed run keeps it.
+/// The time that a run may take. It is in run.json, so that a resumed run keeps it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Budget {
     /// From the command's start to its end.
     pub minutes: f64,
     /// Seconds of it that were over before the first step.
     pub before: f64,
-    /// The time of what follows the last step, in steps as they are at the end.
+    /// The time of the work after the last step, in units of the last steps.
     pub finish: f64,
     /// The duration of steps before the run.
     pub timing: Timing,
@@ -45,7 +46,7 @@ pub(super) struct Place<'a> {
     progress: Position,
     /// Gaussians now, and at most.
     gaussians: [usize; 2],
-    /// Steps of the run that are left as it is planned.
+    /// Remaining planned steps of the run.
     left: usize,
 }
 
@@ -87,10 +88,10 @@ pub(super) struct Replanned {
 #[derive(Clone, Debug)]
 pub(super) struct Planner {
     budget: Budget,
-    /// Seconds between two looks.
+    /// Seconds between two readings.
     interval: f64,
-    /// Seconds since the command's start at the last look.
-    looked: f64,
+    /// Seconds since the command's start at the last reading.
+    last_check: f64,
     /// Seconds of steps since then: taken, and as they were timed before the run.
     taken: [f64; 2],
     /// The machine's slowness: seconds for one as timed before the run.
@@ -100,12 +101,12 @@ pub(super) struct Planner {
 }
 
 impl Planner {
-    /// Begins at so many seconds of the command, behind these plans.
+    /// Begins at this many seconds of the command, behind these plans.
     pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
         // A part that begins late in a command is examined as often as one that begins at once.
-        let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
-        Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
+        let interval = (60.0 * budget.minutes - now).max(0.0) / READINGS;
+        Self { budget, interval, last_check: now, taken: [0.0; 2], slowness: None, last }
     }
 
     /// The time that the run is kept to.
@@ -113,22 +114,23 @@ impl Planner {
         self.budget.minutes
     }
 
-    /// Remembers a step: the seconds that it and what belongs to it took, and those that were expected where it was taken.
+    /// Remembers a step: the seconds that it and what belongs to it took, and those that were expected where it was
+    /// taken.
     pub(super) fn add(&mut self, seconds: f64, expected: f64) {
         self.taken[0] += seconds;
         self.taken[1] += expected;
     }
 
     /// The new plan, where one is due: the end is off, and there is something left to plan.
-    pub(super) fn look(&mut self, now: f64, place: &Place<'_>) -> Option<Replanned> {
+    pub(super) fn replan(&mut self, now: f64, place: &Place<'_>) -> Option<Replanned> {
         let all = 60.0 * self.budget.minutes;
         let at = place.progress.iteration;
-        if now - self.looked < self.interval || at <= self.last || self.taken[1] <= 0.0 {
+        if now - self.last_check < self.interval || at <= self.last || self.taken[1] <= 0.0 {
             return None;
         }
         let measured = self.taken[0] / self.taken[1];
         let slowness = self.slowness.map_or(measured, |old| old + NEWEST * (measured - old));
-        (self.looked, self.taken, self.slowness) = (now, [0.0; 2], Some(slowness));
+        (self.last_check, self.taken, self.slowness) = (now, [0.0; 2], Some(slowness));
         let (timing, [count, cap], schedule) = (&self.budget.timing, place.gaussians, place.schedule_left());
         if schedule == 0 {
             return None;
@@ -185,7 +187,7 @@ mod tests {
         let stages =
             [Stage { maintenance: r.plan().common.maintenance(), half_size_steps, ..Stage::new("all", STEPS) }];
         let timing = timing([START, CAP], [0.004, 0.012], [0.009, 0.025]);
-        // What was planned is what fits.
+        // The plan is what fits.
         let planned = timing.rest(&stages, [0, 0], START, CAP) + FINISH * timing.last(&stages, CAP);
         let budget = Budget { minutes: planned / 60.0, before: 0.0, finish: FINISH, timing };
         let (mut planner, mut rows) = (Planner::new(budget, 0.0, &[]), Vec::new());
@@ -217,7 +219,7 @@ mod tests {
             }
             let left = pace.total() - taken;
             let place = Place { stages: &stages, progress, gaussians: [count as usize, CAP], left };
-            if let Some(new) = planner.look(now, &place) {
+            if let Some(new) = planner.replan(now, &place) {
                 assert_eq!(new.row.at, taken);
                 rows.push(new.row);
             }
@@ -251,7 +253,7 @@ mod tests {
         for (name, slow) in machines {
             let (end, planned, rows) = drive(slow);
             assert!((0.9..=1.1).contains(&end), "{name}: {end:.3} of {planned:.0} s, {rows:?}");
-            assert!(rows.len() <= LOOKS as usize, "{name}: {} plans", rows.len());
+            assert!(rows.len() <= READINGS as usize, "{name}: {} plans", rows.len());
         }
     }
 

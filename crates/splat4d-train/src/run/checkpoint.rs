@@ -2,8 +2,8 @@
 //! losses, codecs and maintenance, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
-//! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
-//! opens it too.
+//! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of
+//! scenes opens it too.
 
 use crate::optim::Moments;
 use crate::step::trainer::{Position, Trainer};
@@ -36,7 +36,7 @@ pub struct Identity {
 /// The state of the run that is not the trainer's.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RunState {
-    /// Seconds of training so far. Never reaches a result.
+    /// Seconds of training. Never affects a result.
     pub seconds: f64,
     /// Smoothed loss, PSNR for progress. Never reach a result.
     pub smooth: [f64; 2],
@@ -184,7 +184,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         iteration: count("iteration")?,
         stage: count("stage")?,
         stage_step: count("stage_step")?,
-        // Files from before runs were planned again do not say: there a step is one of the schedule.
+        // Files from before replanning do not state it: there a step is one of the schedule.
         taken: if meta["taken"].is_null() { count("stage_step")? } else { count("taken")? },
         rests: meta["rests"].as_bool().unwrap_or(false),
         rate_scale: number(&meta["rate_scale"], "rate_scale")?,
@@ -192,15 +192,15 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     };
     let followed = json!(trainer.replans_before(progress.iteration));
     if followed != *meta.get("replans").unwrap_or(&json!([])) {
-        // No damage: an older checkpoint, from before the first of them, would go on as if nothing were wrong.
-        let what = "the checkpoint followed other changes of plan than `run.replans` in recipe.toml says";
+        // No damage: an older checkpoint, from before the first of them, would continue as if nothing were wrong.
+        let what = "the checkpoint followed other changes of plan than those in `run.replans` of recipe.toml";
         return Err(Error::new(ErrorKind::Unsupported, what)
             .remedy("Put recipe.toml back as the run wrote it, or start a new run with -o"));
     }
     let fits = progress.stage <= trainer.stages.len()
         && trainer.stages.get(progress.stage).is_none_or(|s| progress.stage_step < s.iterations.max(1));
     if !fits {
-        return Err(damaged("it stands beyond the recipe's last step".into()));
+        return Err(damaged("it is beyond the recipe's last step".into()));
     }
     let mut train_state = TrainState::resumed(scene, moments, stats);
     train_state.exposure = trainer.train_state.exposure.take();

@@ -15,12 +15,12 @@ impl Stopwatch {
         Self::of(move || start.elapsed().as_secs_f64())
     }
 
-    /// What a function states; it never decreases.
+    /// Time returned by a function; it never decreases.
     pub fn of(seconds: impl Fn() -> f64 + Send + Sync + 'static) -> Self {
         Self(Arc::new(seconds))
     }
 
-    /// Seconds so far.
+    /// Elapsed seconds.
     pub fn seconds(&self) -> f64 {
         (self.0)()
     }

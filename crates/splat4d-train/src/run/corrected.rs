@@ -12,7 +12,7 @@ use std::path::Path;
 /// The file's name in a run.
 pub(crate) const FILE: &str = "refined.json";
 
-/// Writes what the trainer has learnt of cameras, if that is anything.
+/// Writes the learnt corrections of cameras, if there are any.
 pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Result<()> {
     let Some(corrections) = &trainer.train_state.corrections else { return Ok(()) };
     let name = |i: usize| {
@@ -24,7 +24,7 @@ pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Res
     write_atomically(&run.join(FILE), text.as_bytes())
 }
 
-/// What a run has learnt of its cameras; `None`: it was not asked to. Errors: damage.
+/// Learnt corrections of a run's cameras; `None`: it did not learn any. Errors: damage.
 pub fn read(run: &Path) -> Result<Option<Value>> {
     let path = run.join(FILE);
     if !path.is_file() {

@@ -1,8 +1,8 @@
 //! `densify.max_cap = 0`: the number of Gaussians that a capture needs and that its steps can train.
 //!
 //! An image of a surface resolves as much as its pixels do. Views from other positions show other surfaces, or the same
-//! ones closer, so the count follows the pixels of all distinct views. It never falls below the count that small captures
-//! are tuned for ([`LEAST`]), and stays below what the steps can settle and the memory can hold.
+//! ones closer, so the count follows the pixels of all distinct views. It never falls below the count that small
+//! captures are tuned for ([`LEAST`]), and stays below what the steps can settle and the memory can hold.
 
 use super::memory::{available_memory, memory_estimate};
 use super::open::OpenCapture;
@@ -14,16 +14,16 @@ use crate::methods::still;
 use crate::recipe::Recipe;
 use std::collections::BTreeSet;
 
-/// Pixels of distinct views for one Gaussian. Source: published recipes give a real room 0.2 to 1.2 million Gaussians for
-/// four times the pixels of our copy of it, where 150,000 and 300,000 end 1.5 dB above 30,000 after the same processor time
-/// (studies/records/2026-11-26-real-size.md).
+/// Pixels of distinct views for one Gaussian. Source: published recipes give a real room 0.2 to 1.2 million Gaussians
+/// for four times the pixels of our copy of it, where 150,000 and 300,000 end 1.5 dB above 30,000 after the same
+/// processor time (studies/records/2026-11-26-real-size.md).
 const PIXELS: f64 = 350.0;
-/// The same for a static scene, whose Gaussians cost less to train. Source: a walk with 17 megapixels in four minutes ends at
-/// 22.5 dB (SSIM 0.728) with one for 350 pixels and at 23.0 dB (0.762) with one for 120
+/// The same for a static scene, whose Gaussians cost less to train. Source: a walk with 17 megapixels in four minutes
+/// ends at 22.5 dB (SSIM 0.728) with one for 350 pixels and at 23.0 dB (0.762) with one for 120
 /// (studies/records/2026-11-27-real-size.md).
 const PIXELS_STATIC: f64 = 120.0;
-/// Gaussians that one step can settle. Source: the same room in 480 processor seconds: 32 a step end at 27.58 dB (SSIM 0.843),
-/// 100 a step at 27.67 dB (0.849), 4 a step at 26.08 dB (0.788).
+/// Gaussians that one step can settle. Source: the same room in 480 processor seconds: 32 a step end at 27.58 dB (SSIM
+/// 0.843), 100 a step at 27.67 dB (0.849), 4 a step at 26.08 dB (0.788).
 const BY_STEP: f64 = 45.0;
 /// Share of the memory that is free which training may take.
 const MEMORY: f64 = 0.7;
@@ -33,7 +33,7 @@ const LOOKED_AT: usize = 8;
 const CLOSE: usize = 1000;
 
 impl OpenCapture {
-    /// The number of Gaussians for a run of so many steps, and the reason.
+    /// The number of Gaussians for a run of this many steps, and the reason.
     ///
     /// Errors: an image cannot be read.
     pub(super) fn needed(&self, recipe: &Recipe, steps: f64) -> Result<(usize, String)> {
@@ -110,8 +110,8 @@ impl OpenCapture {
     }
 }
 
-/// The most Gaussians, up to `most`, that the steps which fit a time can settle. `steps` returns how many steps fit with a
-/// number of Gaussians; `scale` is the recipe's `count_scale`.
+/// The most Gaussians, up to `most`, that the steps which fit a time can settle. `steps` returns how many steps fit
+/// with a number of Gaussians; `scale` is the recipe's `count_scale`.
 pub(super) fn settled(most: usize, scale: f64, steps: impl Fn(usize) -> Result<usize>) -> Result<usize> {
     let settles = |count: usize| steps(count).map(|n| BY_STEP * n as f64 >= count as f64);
     if settles(most)? {
@@ -135,7 +135,7 @@ fn number(needed: f64, steps: f64, scale: f64) -> usize {
     rounded((scale * needed).min(BY_STEP * steps)).max(fewest(scale))
 }
 
-/// The fewest that a capture's number becomes without want of memory.
+/// The fewest that a capture's number becomes when memory suffices.
 fn fewest(scale: f64) -> usize {
     ((scale * LEAST as f64) as usize).max(1)
 }

@@ -1,4 +1,4 @@
-//! A capture on disk as the trainer sees it: one of its splits, through the image store.
+//! A capture on disk for the trainer: one of its splits, through the image store.
 
 use crate::Result;
 use crate::capture::frames::{Depth, Flow, Frames, Picture, Tracked};

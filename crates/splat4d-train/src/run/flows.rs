@@ -1,4 +1,4 @@
-//! Optical flow of our own, where a capture brings none and the recipe asks for it: followed once from every training
+//! Optical flow of our own, where a capture brings none and the recipe requests it: followed once from every training
 //! image to the next one of its camera, kept next to the run in `flow/`, and from then on the capture's own.
 
 use super::checkpoint::write_atomically;
@@ -14,13 +14,13 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The folder next to the run, and the file that states what its flow is of.
+/// The folder next to the run, and the file that identifies the flow's input.
 const FOLDER: &str = "flow";
 const MARK: &str = "of.txt";
-/// The next training image may be so many frames later: one between them may be held out.
+/// The next training image may be this many frames later: one between them may be held out.
 const MOST_FRAMES: usize = 2;
 
-/// The capture with flow between its training images, where it brings none and the recipe wants our own.
+/// The capture with flow between its training images, where it brings none and the recipe needs our own.
 pub(super) fn complete(
     opened: OpenCapture,
     recipe: &Recipe,
@@ -36,7 +36,7 @@ pub(super) fn complete(
     let kept = crate::files::read(&run.join(FOLDER).join(MARK)).is_ok_and(|text| text == mark.as_bytes());
     if !kept {
         let mut progress = Progress(listen);
-        // Of most images the pyramid is needed twice: as where flow comes from and where it goes.
+        // Of most images the pyramid is needed twice: as source and as target of flow.
         let mut last: Option<(usize, Pyramid)> = None;
         for (done, (frame, file)) in wanted.iter().enumerate() {
             progress.phase("flow from images", done, wanted.len());

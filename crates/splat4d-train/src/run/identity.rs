@@ -1,18 +1,18 @@
-//! What a run is of, in a few digits: a checkpoint is only continued with the same capture and the same recipe.
+//! Fingerprint of a run: a checkpoint is only continued with the same capture and the same recipe.
 
 use super::checkpoint::Identity;
 use crate::capture::Capture;
 use crate::recipe::Recipe;
 use crate::step::replans::ScheduleChanges;
 
-/// The mark of a run: its capture, its recipe and, where there is more to say, `text`.
+/// The mark of a run: its capture, its recipe and, optionally `text`.
 pub(super) fn identity(capture: &Capture, recipe: &Recipe, text: &str) -> Identity {
     Identity { capture: fingerprint(capture), recipe: recipe_print(recipe, text) }
 }
 
-/// A recipe in 16 hexadecimal digits, as it was written before it had tables: runs of then go on.
+/// A recipe in 16 hexadecimal digits, as it was written before it had tables: runs of then continue.
 pub(super) fn recipe_print(recipe: &Recipe, text: &str) -> String {
-    // Settings that only say how memory is spent never reach a result and may change between resumes.
+    // Settings of memory alone never affect a result and may change between resumes.
     let neutral = recipe.clone().with(|r| {
         r.run.image_memory = 0;
         r.run.memory_limit = 0;

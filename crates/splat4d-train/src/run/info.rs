@@ -10,12 +10,12 @@ use std::path::{Path, PathBuf};
 /// Key of the folders and files that a run reads outside of its capture's folder.
 pub(super) const ELSEWHERE: &str = "capture_elsewhere";
 
-/// What a capture reads outside of its folder, for `run.json`.
+/// Files that a capture reads outside its folder, for `run.json`.
 pub(super) fn elsewhere(capture: &Capture) -> Vec<String> {
     capture.elsewhere.iter().map(|path| to_text(path)).collect()
 }
 
-/// What `run.json` records of `elsewhere`: known even if the capture can no longer be opened.
+/// The record of `elsewhere` in `run.json`: known even if the capture can no longer be opened.
 pub fn recorded_elsewhere(info: &Value) -> BTreeSet<PathBuf> {
     info[ELSEWHERE].as_array().into_iter().flatten().filter_map(Value::as_str).map(of_text).collect()
 }

@@ -20,13 +20,13 @@ const STORED_BYTES: [u64; 2] = [4, 7];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
 const PROCESS_BYTES: u64 = 80 << 20;
-/// While a checkpoint is written, values and moments stand twice more in memory: as rows, and as the file. Of the tables.
+/// While a checkpoint is written, values and moments are in memory twice more: as rows, and as the file. Of the tables.
 const CHECKPOINT: [u64; 2] = [3, 2];
 /// Bytes of a number.
 const F32: u64 = 4;
-/// Numbers of a learnable number: itself, its gradient, two moments.
+/// Numbers per learnable number: itself, its gradient, two moments.
 const LEARNT: u64 = 4;
-/// Numbers a splat has in an answer, and as many in its gradient.
+/// Numbers a splat has in a result, and as many in its gradient.
 const ANSWER: u64 = 2 * splat_numbers();
 /// Rows on which a model without nodes is made.
 const FEW: usize = 16;
@@ -64,8 +64,8 @@ fn model(recipe: &Recipe, plan: &TrainContext, rows: usize) -> Result<u64> {
     let few = Few::new(program.as_ref(), plan, rows)?;
     let tables = few.tables(rows);
     let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
-    let question = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
-    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.batch_size as u64 * question)
+    let query = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
+    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.batch_size as u64 * query)
 }
 
 /// A program's model on few rows: as many as it needs for its nodes.
@@ -90,7 +90,7 @@ impl Few {
         Ok(Self { params, motion, nodes })
     }
 
-    /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and the steps that a row has taken.
+    /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and a row's step count.
     fn tables(&self, rows: usize) -> u64 {
         let p = &self.params;
         let bytes = |key| {
@@ -105,7 +105,8 @@ impl Few {
     }
 }
 
-/// Bytes of memory that the system could give a program now, within what its group may take; `None`: it does not say.
+/// Bytes of memory that the system could give a program now, within what its group may take; `None`: it does not report
+/// it.
 pub fn available_memory() -> Option<u64> {
     let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
@@ -131,7 +132,7 @@ mod tests {
     use super::*;
     use crate::run::tests::{Place, recipe};
 
-    /// The tables of a run that stands at its cap, counted, are what was estimated.
+    /// The tables of a run that is at its cap, counted, are what was estimated.
     #[test]
     fn tables_are_counted_with_networks_planes_nodes_and_gains() {
         let place = Place::new();

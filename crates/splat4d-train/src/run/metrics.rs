@@ -34,7 +34,7 @@ impl Totals {
     }
 }
 
-/// A row of metrics.csv: what is known of a step when it was begun, and the whole once it was measured.
+/// A row of metrics.csv: the planned values of a step at its start, and all once it was measured.
 struct Row {
     iteration: usize,
     begun: Option<[Vec<String>; 2]>,
@@ -55,7 +55,7 @@ impl Metrics {
         Self { rows: rows(&text, iteration), every: (iterations / METRIC_ROWS).max(1) }
     }
 
-    /// After a step; whatever it measured may come later.
+    /// After a step; its measurements may arrive later.
     pub(super) fn push(&mut self, trainer: &Trainer<'_>, s: &Stepped, state: &RunState) {
         let i = trainer.progress.iteration;
         if !i.is_multiple_of(self.every) && !trainer.is_done() {
@@ -67,7 +67,7 @@ impl Metrics {
         self.rows.push(Row { iteration: i, begun: Some(begun), cells: Vec::new() });
     }
 
-    /// What a step measured.
+    /// Measurements of a step.
     pub(super) fn measured(&mut self, m: &Measured) {
         if let Some(row) = self.rows.iter_mut().rev().find(|row| row.iteration == m.iteration)
             && let Some([before, after]) = row.begun.take()

@@ -19,7 +19,7 @@ const TIMED: usize = 37;
 const WARM_UP: f64 = 1.0 / 3.0;
 /// Steps that are timed however long they take.
 const LEAST: usize = 6;
-/// Steps between two densifications of the probe, and at most so many steps until it stands at the cap.
+/// Steps between two densifications of the probe, and at most this many steps until it is at the cap.
 const HURRIED: usize = 20;
 /// See [`HURRIED`].
 const GROWTH_STEPS: usize = 400;
@@ -49,7 +49,7 @@ struct Steps {
 }
 
 impl Steps {
-    /// Seconds a step of `stage` takes, `place` steps into its schedule, with so many Gaussians.
+    /// Seconds a step of `stage` takes, `place` steps into its schedule, with this many Gaussians.
     fn at(&self, stage: &Stage, place: usize, count: f64) -> f64 {
         let ([start, end], [few, many]) = (self.gaussians.map(|n| n as f64), self.seconds);
         let size = usize::from(place >= stage.half_size_steps);
@@ -72,8 +72,8 @@ impl Timing {
             listen(&Event::Phase { name: "timing steps".into(), done, total: 2 });
         };
         tell(listen, 0);
-        // A filter would be switched on later than the probes look.
-        // The number of Gaussians may become smaller, and the initial one with it: the fewest are timed.
+        // A filter would be switched on later than the probes measure. The number of Gaussians may become smaller, and
+        // the initial one with it: the fewest are timed.
         let least = recipe.clone().with(|r| r.densify.max_cap = 0).initial_count();
         let recipe = recipe.unresolved().with(|r| (r.filter.start, r.init.count) = (0.0, least));
         let plan = opened.plan(&recipe);
@@ -85,8 +85,8 @@ impl Timing {
         let until = |part: f64| began + part * seconds;
         let start = scene.len();
         // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
-        // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it is
-        // kept.
+        // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it
+        // is kept.
         let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene.clone())?, clock };
         probe.trainer.check_not_empty()?;
         let few = probe.rates(until(PARTS[0]))?;
@@ -109,7 +109,7 @@ impl Timing {
         Ok(Self { stages, scene: first })
     }
 
-    /// Seconds of one step in a place of the schedule, with so many Gaussians.
+    /// Seconds of one step in a place of the schedule, with this many Gaussians.
     pub(super) fn step(&self, stages: &[Stage], stage: usize, place: usize, count: usize) -> f64 {
         stages.get(stage).map_or(0.0, |s| self.stages[stage.min(1)].at(s, place, count as f64))
     }
@@ -142,7 +142,8 @@ impl Timing {
         self.step(stages, stages.len() - 1, usize::MAX, cap.max(self.stages[0].gaussians[0]))
     }
 
-    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as so many steps at the end.
+    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as this many steps at the
+    /// end.
     pub(super) fn fit(&self, opened: &OpenCapture, recipe: &Recipe, seconds: f64, finish: f64) -> Result<Recipe> {
         let recipe = recipe.unresolved();
         let cost = |iterations: usize| -> Result<f64> {
@@ -172,8 +173,8 @@ impl Probe<'_> {
         }
     }
 
-    /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run of
-    /// one stage has the first twice. It is over by `until`, if only a few steps are.
+    /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run
+    /// of one stage has the first twice. It ends by `until`, if only a few steps.
     fn rates(&mut self, until: f64) -> Result<[[f64; 2]; 2]> {
         let sizes = [usize::MAX, 0];
         let all = sizes.len() * self.trainer.stages.len().min(2);

@@ -1,5 +1,5 @@
-//! [`OpenCapture`]: a capture as a recipe wants it, opened for training, and what is made of it: a plan, a first scene, a
-//! trainer.
+//! [`OpenCapture`]: a capture as a recipe specifies, opened for training, and what is made of it: a plan, a first
+//! scene, a trainer.
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
@@ -22,7 +22,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Images whose mean colour stands for all of them.
+/// Images whose mean colour represents all of them.
 const LOOKED_AT: usize = 16;
 
 /// Extent of cameras in a single place, scene units.
@@ -48,13 +48,13 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     })
 }
 
-/// Opens a capture as a recipe wants it: scale, split, and the part of the capture that is used.
+/// Opens a capture as a recipe specifies: scale, split, and the part of the capture that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     open_frames(path, recipe, Vec::new(), &Lenses::default())
 }
 
-/// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]). `lenses`:
-/// what another part of it found ([`Capture::lenses`]).
+/// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]).
+/// `lenses`: what another part of it found ([`Capture::lenses`]).
 pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lenses: &Lenses) -> Result<Capture> {
     let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };
     let mut capture = Capture::open(path, &options)?;
@@ -114,7 +114,7 @@ pub(crate) struct OpenCapture {
     pub(crate) capture: Arc<Capture>,
     pub(crate) frames: Arc<Dataset>,
     pub(crate) simd: Simd,
-    /// What its trainers draw with.
+    /// The device of its trainers.
     pub(crate) device: Device,
 }
 
@@ -143,7 +143,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> TrainContext {
     let of_rigs = capture.train.iter().map(|&i| (capture.frames[i].camera, capture.frames[i].time.0));
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
-    // Cameras that all have the same position say nothing of the scene's size.
+    // Cameras that all have the same position carry no information about the scene's size.
     let (center, radius) = capture.center_and_radius();
     TrainContext {
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
@@ -174,8 +174,8 @@ fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
     Ok(sums.map(|s| (s / pixels.max(1.0)) as f32))
 }
 
-/// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the frames
-/// of a model that is learnt frame by frame.
+/// Corrections of cameras that a recipe enables. Clocks carry no information where nothing moves, and nothing can be
+/// queried between the frames of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
     let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
     RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }
@@ -196,7 +196,7 @@ impl OpenCapture {
         Self { capture: frames.capture().clone(), frames, simd: Simd::detect(), device: Device::Cpu }
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(crate) fn on(self, device: Device) -> Self {
         Self { device, ..self }
     }
@@ -214,14 +214,13 @@ impl OpenCapture {
 
     /// The recipe with a motion model that suits the capture, and why it is that one.
     pub(super) fn chosen(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<(Recipe, auto::Choice)> {
-        listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
+        listen(&Event::Phase { name: "examining the capture".into(), done: 0, total: 0 });
         let choice = auto::choose(&self.plan(&recipe), recipe.programs(), self.frames.as_ref())?;
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
-    /// What shows where no Gaussian is: what images were cut out of or, where they fill their frames, their mean
-    /// colour, which
-    /// is the best guess at what no training camera sees. Errors: an image cannot be read.
+    /// The background: that of cut-out images or, for full frames, their mean colour, which is the best estimate for
+    /// pixels that no training camera sees. Errors: an image cannot be read.
     pub(super) fn background(&self) -> Result<[f32; 3]> {
         match self.capture.background {
             Some(told) => Ok(told),
@@ -247,7 +246,7 @@ impl OpenCapture {
         Ok(Scene { offset: self.capture.offset, ..scene })
     }
 
-    /// Where the first Gaussians of a plan are.
+    /// Source of the first Gaussians of a plan.
     pub(super) fn seeds(&self, recipe: &Recipe, plan: &TrainContext) -> Result<Seeds> {
         let program = recipe.program()?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
@@ -259,13 +258,13 @@ impl OpenCapture {
             self.capture.points.as_ref().map(Seeds::of)
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
-        match moving && program.one_moment(plan) {
-            true => init::one_moment(&first, &recipe.initial(), frames, points),
+        match moving && program.one_time(plan) {
+            true => init::one_time(&first, &recipe.initial(), frames, points),
             false => init::seeds(&first, &recipe.initial(), frames, points, moving),
         }
     }
 
-    /// What is to be learnt of cameras, where the recipe wants it.
+    /// Corrections of cameras to learn, if enabled in the recipe.
     fn corrections(&self, recipe: &Recipe, plan: &TrainContext) -> Option<Corrections> {
         let settings = learnable(recipe);
         if !settings.poses && !settings.focal && !settings.times {
@@ -283,7 +282,7 @@ impl OpenCapture {
         let program = recipe.program()?;
         let mut trainer = self.trainer_of(recipe, plan, scene, stages(program.as_ref(), plan));
         trainer.replan(recipe.run.replans.rows());
-        // What a still scene cannot show must not draw it away from what it can.
+        // What a still scene cannot show must not render it away from what it can.
         let strength = if program.capabilities(plan).moves { plan.common.loss.moving } else { 0.0 };
         trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)

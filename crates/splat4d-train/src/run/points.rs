@@ -19,15 +19,14 @@ use std::sync::Arc;
 const FILE: &str = "points.ply";
 /// Of the initial Gaussians: with fewer points of its own, a capture's images are searched for more.
 const FEW: f64 = 0.05;
-/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) brings too few as
-/// well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
-/// synthetic rooms
-/// have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
+/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) has too few
+/// as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
+/// synthetic rooms have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
 const BARE: f64 = 0.2;
-/// Cells along an image's longer side in which that is counted; of a rig at most so many views.
+/// Cells along an image's longer side in which that is counted; of a rig at most this many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
-/// Of the initial Gaussians, the points that are searched for: what is between them is laid along surfaces.
+/// Of the initial Gaussians, the points that are searched for: the others are placed between them along surfaces.
 const WANTED: f64 = 0.5;
 
 /// The capture with points from its images, where it brings too few and the recipe lets them be searched for.
@@ -93,7 +92,7 @@ fn bare(capture: &Capture, points: &[[f64; 3]]) -> f64 {
     shares.get(shares.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// The share of the cells of an image in which no point lies, nor in the eight around it.
+/// The share of the cells of an image without a point in them or in the eight around.
 fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     let side = camera.width.max(camera.height) as f64 / CELLS;
     let [columns, rows] = [camera.width, camera.height].map(|n| (n as f64 / side).round().max(1.0) as usize);
@@ -113,14 +112,14 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     covered.iter().filter(|c| !**c).count() as f64 / covered.len() as f64
 }
 
-/// The times at which moving points are wanted.
+/// The times at which moving points are needed.
 fn moments(recipe: &Recipe, plan: &TrainContext) -> Result<Vec<f64>> {
     let program = recipe.program()?;
     let mut settings = recipe.init.clone();
     if !program.capabilities(plan).moves || plan.times < 2 {
         return Ok(Vec::new());
     }
-    if program.one_moment(plan) {
+    if program.one_time(plan) {
         settings.keyframes = 1;
     }
     Ok(init::keyframes(&program.first(plan), &settings))
@@ -149,7 +148,7 @@ mod tests {
         };
         assert!(train(), "the capture has no points");
         assert!(!train(), "what was found is still there");
-        // The file is taken at its word as long as it is of the same capture and wish.
+        // The file is trusted if it is of the same capture and settings.
         let file = run.join(FILE);
         let text = String::from_utf8_lossy(&std::fs::read(&file).unwrap()).into_owned();
         let mark = text.lines().find(|l| l.starts_with("comment")).unwrap().to_owned();

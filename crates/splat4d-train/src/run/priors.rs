@@ -1,6 +1,5 @@
-//! What files say of a capture next to its images, held against these: before training what can be checked at once,
-//! after it
-//! what the scene made of them.
+//! Checks of priors (depth, flow) against the images: before training what can be checked at once, after it what the
+//! scene made of them.
 
 use super::open::{OpenCapture, training_frames};
 use crate::capture::frames::{Depth, Frames, Picture};
@@ -22,23 +21,24 @@ const FEW: usize = 20;
 const ENOUGH: usize = 200;
 /// Another reading of flow is the right one if it leaves less than this share of the difference between images.
 const CLEARLY: f64 = 0.7;
-/// Logarithm of the factor beyond which depths and points are at different scales: more than the points' own noise leaves of
-/// the median of hundreds.
+/// Logarithm of the factor beyond which depths and points are at different scales: more than the points' own noise
+/// leaves of the median of hundreds.
 const OTHER_SCALE: f64 = 0.02;
 /// Share of the points that what is in front of them hides from an image at most but for this: the scale is that of the
-/// closest so many ratios.
+/// closest this many ratios.
 const VISIBLE: f64 = 0.3;
-/// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at whatever
-/// scale: noise of a quarter of the depth does as much, and single-image networks have less.
+/// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at
+/// whatever scale: noise of a quarter of the depth does as much, and single-image networks have less.
 const FOREIGN: f64 = 0.1;
-/// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is reported: what is before
-/// a point hides it, and what it is itself nothing can be before.
+/// Share of the points that are before what a metric map shows, by more than [`METRIC_OFF`], from which on it is
+/// reported: surfaces in front of a point hide it, and nothing can be in front of the point's own surface.
 const BEFORE: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
 const METRIC_OFF: f64 = 0.1;
 const CORRELATED: f64 = 0.8;
 
-/// Checks flow and depth before training; returns warnings. Errors: flow that runs backwards, or whose axes are exchanged.
+/// Checks flow and depth before training; returns warnings. Errors: flow that runs backwards, or whose axes are
+/// exchanged.
 pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String>> {
     let capture = &opened.capture;
     let mut warnings = Vec::new();
@@ -57,7 +57,7 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
     Ok(warnings)
 }
 
-/// What is to be said of metric maps that show surfaces behind points that were seen before them.
+/// Report about metric maps with surfaces behind points that were seen in front of them.
 fn points_before(opened: &OpenCapture) -> Result<Option<String>> {
     let looked = ratios(opened)?;
     let told = |(i, ratios): &(usize, Vec<f64>)| {
@@ -150,9 +150,9 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
 enum Depths {
     /// They agree, or cannot be compared.
     Fit,
-    /// The points are so many times as far away, everywhere.
+    /// The points are this many times as far away, everywhere.
     Scaled(f64),
-    /// Even the closest scatter about the points by this (logarithm): no unit mends that.
+    /// Even the closest scatter about the points by this (logarithm): no unit corrects that.
     Foreign(f64),
 }
 
@@ -178,8 +178,8 @@ fn ratios(opened: &OpenCapture) -> Result<Vec<(usize, Vec<f64>)>> {
     Ok(all)
 }
 
-/// How the metric depth maps of a capture relate to its points: by where their ratios are densest, since a point that something hides
-/// is farther away than what is seen there.
+/// How the metric depth maps of a capture relate to its points: by where their ratios are densest, since a point that
+/// something hides is farther away than what is seen there.
 fn depths(opened: &OpenCapture) -> Result<Depths> {
     let mut ratios: Vec<f64> = ratios(opened)?.into_iter().flat_map(|(_, ratios)| ratios).collect();
     if ratios.len() < ENOUGH {
@@ -201,8 +201,8 @@ fn is_metric(capture: &Capture, frame: usize) -> bool {
     capture.frames[frame].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric)
 }
 
-/// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to be
-/// said of that: poses and points are of one unit, and images were matched to find them.
+/// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to
+/// be reported of that: poses and points are of one unit, and images were matched to find them.
 pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapture, Option<String>)> {
     if recipe.loss.depth <= 0.0 || !opened.capture.train.iter().any(|&i| is_metric(&opened.capture, i)) {
         return Ok((opened, None));
@@ -234,7 +234,8 @@ pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapt
     Ok((OpenCapture::with(frames).on(opened.device), Some(message)))
 }
 
-/// Holds the trained scene against the depth maps that it was trained on; returns warnings of those that it contradicts.
+/// Holds the trained scene against the depth maps that it was trained on; returns warnings of those that it
+/// contradicts.
 pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -> Result<Vec<String>> {
     let capture = &opened.capture;
     let antialias = if recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
@@ -252,7 +253,7 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
         let Some(apart) = apart([&image.depth, &image.alpha], Depth::truth(depth)) else { continue };
         let told = match apart {
             Apart::Ratio(ratio, off) if off > METRIC_OFF => {
-                format!("by {:.0} % (it draws {ratio:.2} times the depth)", 100.0 * off)
+                format!("by {:.0} % (it renders {ratio:.2} times the depth)", 100.0 * off)
             }
             Apart::Correlation(r) if r < CORRELATED => format!("(correlation {r:.2})"),
             _ => continue,
@@ -268,7 +269,7 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
     )])
 }
 
-/// Draws a training frame with its depth.
+/// Renders a training frame with its depth.
 fn draw(scene: &Scene<f32>, opened: &OpenCapture, i: usize, renderer: &mut Renderer<f32>, out: &mut Image<f32>) {
     let mut instant = Evaluation::default();
     scene.at(opened.frames.time(i), &mut instant);
@@ -297,7 +298,7 @@ mod tests {
         wall((x as f64 + 0.5 - 16.0) / FOCAL)
     }
 
-    /// Two cameras in one place look at the wall, with points on it; maps say `told` of a column.
+    /// Two cameras in one place look at the wall, with points on it; maps report `told` for a column.
     fn opened(folder: &Path, kind: &str, told: &dyn Fn(usize) -> f64) -> OpenCapture {
         let mut cameras = Vec::new();
         for c in 0..2 {
@@ -359,7 +360,7 @@ mod tests {
         let (hidden, _) =
             believed(opened(folder.path(), "metric", &|x| depth(x) * if x < 21 { 1.0 } else { 0.5 }), &recipe).unwrap();
         assert_eq!(before(&hidden, &recipe).unwrap(), Vec::<String>::new());
-        // What claims no unit is held against the scene alone, and what is not read is not examined.
+        // Maps without a unit are compared with the scene alone, and unread ones are not examined.
         let relative = opened(folder.path(), "relative", &|x| depth(SIDE - 1 - x));
         assert_eq!(believed(relative, &recipe).unwrap().1, None);
         let off = recipe.with(|r| r.loss.depth = 0.0);

@@ -10,7 +10,7 @@ use crate::recipe::Recipe;
 use crate::step::trainer::Trainer;
 use std::sync::Arc;
 
-/// A capture, opened for training as a recipe wants it.
+/// A capture, opened for training as a recipe specifies.
 pub struct Probe {
     trainer: Trainer<'static>,
     identity: Identity,
@@ -32,7 +32,8 @@ impl Probe {
         checkpoint::write(&self.trainer, &self.identity, &RunState::default())
     }
 
-    /// Reads a checkpoint and takes a step from there, as `train --resume` does. Errors: it is damaged, or of something else.
+    /// Reads a checkpoint and takes a step from there, as `train --resume` does. Errors: it is damaged, or of something
+    /// else.
     pub fn resume(&mut self, bytes: &[u8]) -> Result<()> {
         checkpoint::read(bytes, &mut self.trainer, &self.identity)?;
         self.trainer.enter(&mut Progress(&mut |_| {}))?;

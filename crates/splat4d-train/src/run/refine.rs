@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 
 /// A refinement of a scene.
 pub(crate) struct Refine {
-    /// The verb that asks for it: run.json names it, and errors suggest to continue with it.
+    /// The verb that requests it: run.json names it, and errors suggest to continue with it.
     pub made_by: String,
     /// The scene before the first stage.
     pub scene: Scene<f32>,
@@ -32,10 +32,10 @@ pub(crate) struct Refine {
     pub stages: Vec<Stage>,
     /// The frames that the scene is compared with (`training_frames`).
     pub frames: Arc<Dataset>,
-    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
-    /// not count: the scene and the stages have theirs.
+    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations
+    /// do not count: the scene and the stages have theirs.
     pub recipe: Recipe,
-    /// Exposures of the cameras; none: they show what is drawn, unless the recipe lets them learn.
+    /// Exposures of the cameras; none: they show what is rendered, unless the recipe lets them learn.
     pub exposure: Option<Exposure>,
     /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
     /// with the same.
@@ -49,15 +49,15 @@ pub(crate) struct Refine {
 pub(crate) struct Refined {
     /// How the run ended.
     pub outcome: Outcome,
-    /// The scene that learns. Where the last stage has a codec, what is seen of it is another: that one is in the run's
+    /// The scene that learns. If the last stage has a codec, the decoded scene differs: it is in the run's
     /// `scene.safetensors`.
     pub scene: Scene<f32>,
 }
 
 /// Begins the run in the folder `run`, or continues it, exactly, where that holds one.
 ///
-/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers remember
-/// comes from the checkpoint. Errors: the folder holds another run; what stages and files may say.
+/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers store
+/// is read from the checkpoint. Errors: the folder holds another run; what stages and files may say.
 pub(crate) fn refine(
     job: Refine,
     run: &Path,
@@ -67,11 +67,11 @@ pub(crate) fn refine(
 ) -> Result<Refined> {
     job.recipe.check()?;
     if job.stages.is_empty() {
-        return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
+        return Err(Error::input("there is no stage to run").remedy("Request at least one step"));
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
     let begun = !checkpoint::list(run).is_empty();
-    // What a run that was begun followed; not what was followed by the run that the scene comes from.
+    // The plan of this run, not that of the run that produced the scene.
     let replans = if begun { followed(run)? } else { ScheduleChanges::default() };
     let recipe = job
         .recipe
@@ -103,7 +103,7 @@ pub(crate) fn refine(
     }
     let state = if begun {
         let state = session.restore(&mut trainer, listen)?;
-        // The budget is that of this command: what was trained before it does not count.
+        // The budget is that of this command: earlier training does not count.
         let before = options.clock.seconds() - state.seconds;
         session.budget = session.budget.map(|b| Budget { before, ..b });
         state

@@ -30,15 +30,16 @@ use std::time::{Duration, Instant as Clock};
 /// Options of a run in addition to its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
-    /// What draws. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
+    /// The renderer. It is not part of the recipe: a run may be resumed on another device, with other last bits.
     pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
-    /// fitted again while the run goes.
+    /// fitted again during the run.
     pub minutes: Option<f64>,
-    /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
-    /// of training; `minutes` leaves room for it.
+    /// The caller's work after training (evaluation, film, baking) takes about as long as this many steps at the end of
+    /// training; `minutes` includes it.
     pub finish: f64,
-    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is said anyhow.
+    /// Time steps before the run and report by [`Event::Predicted`] how long it will take. With `minutes` it is
+    /// reported anyhow.
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.
     pub clock: Stopwatch,
@@ -87,8 +88,9 @@ pub struct Outcome {
 
 /// Share of the largest number of Gaussians from which on a run is at its cap.
 const AT_CAP: f64 = 0.98;
-/// PSNR of training views below which a cloud at its cap is too small for them, dB: a real room of 292 photos ends at 26.5
-/// with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29 (studies/records/2026-11-26-real-size.md).
+/// PSNR of training views below which a cloud at its cap is too small, dB: a real room of 292 photos ends at 26.5 with
+/// 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29
+/// (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
 
 /// Advice for a run that ends at its cap with blurred training views.
@@ -111,7 +113,7 @@ pub(super) const ROLLBACK_RATE: f64 = 0.5;
 const SMOOTHING: f64 = 0.05;
 /// Seconds between two progress events.
 const PROGRESS_SECONDS: f64 = 0.25;
-/// Puts the newest sound checkpoint into the trainer. A damaged newest one is skipped, and said so.
+/// Loads the newest intact checkpoint. A damaged newest one is skipped with a warning.
 pub(super) fn restore_newest(
     run: &Path,
     trainer: &mut Trainer<'_>,
@@ -123,7 +125,7 @@ pub(super) fn restore_newest(
             .and_then(|bytes| checkpoint::read(&bytes, trainer, identity).map_err(|e| e.at(path.display())));
         match read {
             Ok(state) => return Ok((state, first_error.map(|e: Error| e.to_string()))),
-            // Another version or capture is not damage: older ones would say the same.
+            // Another version or capture is not damage: older ones would fail alike.
             Err(e) if e.kind() == ErrorKind::Unsupported => return Err(e),
             Err(e) => first_error = first_error.or(Some(e)),
         }
@@ -221,7 +223,7 @@ impl Session<'_> {
         write_atomically(&self.run.join("recipe.toml"), recipe.to_toml().as_bytes())
     }
 
-    /// Goes to the newest sound checkpoint, and warns of what was skipped.
+    /// Loads the newest intact checkpoint, and warns of what was skipped.
     pub(super) fn restore(&self, trainer: &mut Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let (state, warning) = restore_newest(self.run, trainer, &self.identity)?;
         if let Some(message) = warning {
@@ -291,9 +293,9 @@ impl Session<'_> {
             state.seconds += seconds;
             if let Some(planner) = &mut planner {
                 planner.add(between + seconds, expected);
-                if let Some(new) = planner.look(clock + lead, &Place::of(trainer)) {
+                if let Some(new) = planner.replan(clock + lead, &Place::of(trainer)) {
                     recipe.run.replans.push(new.row);
-                    // What is on disk is what is followed, and the other way round.
+                    // The plan on disk equals the one in use.
                     self.write_recipe(&recipe)?;
                     trainer.replan(recipe.run.replans.rows());
                     if let Some(late) = new.late.filter(|_| !warned) {
@@ -327,7 +329,7 @@ impl Session<'_> {
                 listen(&self.progress(trainer, &state, &steps));
             }
             let i = trainer.progress.iteration;
-            // What the start of a later stage did may have taken long: it is not to be done twice.
+            // The start of a later stage may have taken long: it must not be repeated.
             let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
             let looked_at = due || snapshots.as_ref().is_some_and(Snapshots::is_due);
             if looked_at {
@@ -375,7 +377,7 @@ impl Session<'_> {
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
     }
 
-    /// Says on what it trains, where that was asked for or is not what it was before.
+    /// Reports the device if it was requested or has changed.
     fn report_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
         let device = &trainer.device;
         // Older runs, from before other devices existed, name none.
@@ -383,7 +385,7 @@ impl Session<'_> {
         let before = info["device"].as_str().unwrap_or(&trainer.device.name);
         let mut why = device.why.clone();
         if before != device.name {
-            why = format!("{why}; before it was {before}, and from here on last bits may be others");
+            why = format!("{why}; before it was {before}, and from here on the last bits may differ");
         } else if self.opened.device == Device::Cpu {
             return;
         }
@@ -422,7 +424,7 @@ impl Session<'_> {
         self.write_info(totals, trainer, state, finished)
     }
 
-    /// run.json: what the run is and how it went.
+    /// run.json: the run's inputs and its state.
     fn write_info(&self, totals: &Totals, trainer: &Trainer<'_>, state: &RunState, finished: bool) -> Result<()> {
         let (capture, recipe) = (&self.opened.capture, self.recipe);
         let steps = totals.steps.max(1) as f64;
@@ -458,8 +460,8 @@ impl Session<'_> {
         write_atomically(&self.run.join("run.json"), text.as_bytes())
     }
 
-    /// Back to the last checkpoint with half the rates; the third time the run is given up. A device that failed is not to blame for
-    /// the numbers: the rates stay.
+    /// Back to the last checkpoint with half the rates; the third time the run is given up. A device that failed is not
+    /// to blame for the numbers: the rates stay.
     fn roll_back(&self, trainer: &mut Trainer<'_>, fault: &Fault, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let Fault(what, blame, _) = fault;
         let (strike, share) = if *blame == Blame::Device { (0, 1.0) } else { (1, ROLLBACK_RATE) };
@@ -479,7 +481,7 @@ impl Session<'_> {
         listen(&match blame {
             Blame::Numbers => Event::RolledBack { iteration: failed, to, what },
             Blame::Device => {
-                let message = format!("{what}: training goes on on the CPU, from its last checkpoint, of step {to}");
+                let message = format!("{what}: training continues on the CPU, from its last checkpoint, of step {to}");
                 Event::Warning { message }
             }
         });

@@ -1,4 +1,4 @@
-//! The scene while it learns, as a playback file: for the live view. It only reads, so that the result stays the same
+//! The scene during training, as a playback file: for the live view. It only reads, so that the result stays the same
 //! to the bit.
 
 use super::metrics::psnr;
@@ -16,7 +16,7 @@ use splat4d::scene::{Camera, time::DEFAULT_FPS};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Training goes on for so many times as long as the last snapshot took: at most 2.5 % of the time.
+/// Training continues for this many times as long as the last snapshot took: at most 2.5 % of the time.
 const REST: u32 = 40;
 /// Entries of the palette, rounds that fit it, effort of deflate: a snapshot is examined for seconds.
 const PALETTE: usize = 256;
@@ -124,11 +124,11 @@ impl Snapshots {
     }
 
     fn bytes(&self, scene: &Scene<f32>) -> Result<Vec<u8>> {
-        // Without a tolerance nothing is split: one look at every frame, one piece a Gaussian.
-        // A page that follows a run has the whole file at once: nothing is ranked.
+        // Without a tolerance nothing is split: one sample per frame, one segment per Gaussian. A page that follows a
+        // run has the whole file at once: nothing is ranked.
         let options = Options {
             tolerance: f64::INFINITY,
-            looks: 0.0,
+            sample_rate: 0.0,
             cameras: self.poses.clone(),
             rank: false,
             ..Options::default()

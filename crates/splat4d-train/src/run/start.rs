@@ -1,4 +1,4 @@
-//! How a run begins, and how it goes on from its folder.
+//! How a run begins, and how it continues from its folder.
 
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
@@ -47,7 +47,7 @@ pub fn train(
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let mut listen = listen;
-    // Before the model is chosen by what maps say; again where points have to be found first.
+    // Before the model is chosen by what maps indicate; again where points have to be found first.
     let (opened, early) = priors::believed(opened, &recipe)?;
     let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
     recipe.program()?.check(&opened.plan(&recipe))?;
@@ -105,7 +105,7 @@ pub fn train(
     session.drive(&mut trainer, state, &mut listen)
 }
 
-/// A recipe, and what is known of the time that it takes.
+/// A recipe and its estimated time.
 struct Timed {
     recipe: Recipe,
     /// From the command's start to its end.
@@ -113,7 +113,7 @@ struct Timed {
     budget: Option<Budget>,
 }
 
-/// Times steps where the options ask for it, and fits the recipe to its minutes.
+/// Times steps where the options request it, and fits the recipe to its minutes.
 fn timed(
     opened: &OpenCapture,
     recipe: Recipe,
@@ -159,7 +159,7 @@ pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> 
     resume_with(run, &TrainOptions::default(), stop, listen)
 }
 
-/// What training with all defaults would take.
+/// Estimated cost of training with all defaults.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Forecast {
     /// The motion model that would be learnt.
@@ -174,7 +174,7 @@ pub struct Forecast {
     pub memory: u64,
 }
 
-/// Looks at a capture as `train` would before its first step.
+/// Examines a capture as `train` would before its first step.
 ///
 /// Errors: what `train` would refuse the capture for, images that cannot be read.
 pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result<Forecast> {
@@ -187,8 +187,8 @@ pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result
     Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, gaussians, memory })
 }
 
-/// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the start. A run with
-/// `minutes` keeps to what is left of them: time between the commands does not count.
+/// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the
+/// start. A run with `minutes` keeps to what is left of them: time between the commands does not count.
 pub fn resume_with(
     run: &Path,
     options: &TrainOptions,
@@ -239,7 +239,8 @@ pub fn resume_with(
     session.drive(&mut trainer, state, &mut listen)
 }
 
-/// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture has gone.
+/// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture is
+/// missing.
 pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let text = read_text(&run.join("recipe.toml"))?;
     let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;

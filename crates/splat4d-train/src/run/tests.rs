@@ -1,5 +1,5 @@
-//! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash; faults
-//! that roll back; outputs, memory and checkpoints that are refused.
+//! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash;
+//! faults that roll back; outputs, memory and checkpoints that are refused.
 
 mod device;
 mod observe;
@@ -25,7 +25,7 @@ use serde_json::{Value, json};
 use splat4d::format::dialect::WriteOptions;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Wanted};
+use splat4d::render::{Abilities, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::{Camera, Table};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -38,13 +38,13 @@ const CAMERAS: usize = 4;
 const MOMENTS: usize = 3;
 const STEPS: usize = 40;
 
-/// Four cameras, so many frames, on disk.
+/// Four cameras, this many frames, on disk.
 fn capture_on_disk(moments: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Made::new(CAMERAS, MOMENTS, SIZE);
     let mut picture = Picture::default();
     for i in 0..CAMERAS * moments {
-        // To and fro, so that it stays in sight.
+        // Back and forth, so that it stays visible.
         let moment = [0, 1, 2, 1][i / CAMERAS % 4];
         made.load(CAMERAS * moment + i % CAMERAS, &mut picture).unwrap();
         let path = folder.path().join(format!("images/{}/{:04}.png", i % CAMERAS, i / CAMERAS));
@@ -87,7 +87,7 @@ pub(crate) fn recipe(changes: &[&str]) -> Recipe {
     r
 }
 
-/// A folder with the capture and room for runs.
+/// A folder with the capture and space for runs.
 pub(crate) struct Place {
     capture: TempDir,
     runs: TempDir,
@@ -116,7 +116,7 @@ impl Place {
         train(self.open(recipe), recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {})
     }
 
-    /// As `train`, with another drawing device and ears.
+    /// As `train`, with another rendering device and ears.
     fn train_with(
         &self,
         name: &str,
@@ -201,7 +201,7 @@ fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<d
 }
 
 impl<F: FnMut(usize, &mut Image<f32>) + Send> Backend for Meddled<F> {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         self.inner.can(wanted)
     }
 
@@ -308,8 +308,8 @@ fn a_killed_run_resumes_from_whatever_is_on_disk() {
             let run = place.run(&name);
             let list = checkpoint::list(&run);
             let newest = std::fs::read(&list[list.len() - 1]).unwrap();
-            // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint cut
-            // short, beyond the sound one.
+            // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint
+            // cut short, beyond the sound one.
             std::fs::write(run.join("checkpoints/.00000099.safetensors.123.tmp"), &newest[..newest.len() / 3]).unwrap();
             let mut damaged = newest[..newest.len() / 2].to_vec();
             if i % 2 == 1 {
@@ -434,7 +434,8 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
         place.run(name)
     };
     let newest = |run: &Path| checkpoint::list(run).pop().unwrap();
-    // Another version, the one before or a later one: the last number called `version` in the header is the checkpoint's own.
+    // Another version, the one before or a later one: the last number called `version` in the header is the
+    // checkpoint's own.
     for version in [b'2', b'9'] {
         let run = copy(&format!("version-{version}"));
         let mut bytes = std::fs::read(newest(&run)).unwrap();
@@ -461,7 +462,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     let error = resume_quietly(&run).unwrap_err().to_string();
     assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
-    // What only states how memory is spent may change.
+    // Settings of memory alone may change.
     let run = copy("memory");
     let other = base.resolve().with(|r| {
         r.run.image_memory = 1 << 20;
@@ -563,7 +564,7 @@ fn opaque_captures_get_their_mean_colour_as_background_and_masked_ones_their_own
         capture.train.iter().map(of).sum::<f64>() / capture.train.len() as f64
     });
     let found = shown(capture.clone());
-    // Sixteen images stand for all.
+    // Sixteen images represent all.
     assert!((0..3).all(|c| (f64::from(found[c]) - mean[c]).abs() < 0.02 && mean[c] > 0.05), "{found:?} {mean:?}");
     let told = [0.9, 0.1, 0.4];
     assert_eq!(shown(Arc::new(Capture { background: Some(told), ..Capture::clone(&capture) })), told);
@@ -637,7 +638,7 @@ fn scenes_with_a_head_are_evaluated_with_it_and_not_exported_without() {
     let params = &scene.layers[layer].params;
     assert_eq!(keys, HeadKeys::of(params).unwrap());
     assert!((0..18).any(|i| params[keys.second].get(i, 0).abs() > 1e-3), "the network has learnt something");
-    // Evaluation draws the head: one that is turned up changes the score.
+    // Evaluation renders the head: one that is turned up changes the score.
     let mut loud = scene.clone();
     loud.layers[layer].params[keys.second].fill(2.0);
     // Hidden units that the held-out camera wakes, which looks along -x; by chance it may wake none.
@@ -671,7 +672,7 @@ fn results_report_conditions_and_colour_corrected_psnr() {
     let recipe = recipe(&["hold_out=camera=0"]);
     place.train("a", &recipe).unwrap();
     let mut scene = splat4d::format::scene::read(&place.scene("a")).unwrap();
-    // The images are opaque, but say that they were not.
+    // The images are opaque, but are declared not to be.
     let open = |background| Arc::new(Capture { background: Some(background), ..(*place.open(&recipe)).clone() });
     let mut measure = |capture: &Arc<Capture>, measured, entry: Option<&str>| {
         let options =

@@ -6,13 +6,13 @@ use super::nearest;
 pub(crate) trait Value: Sized {
     /// As TOML.
     fn to_toml(&self) -> toml::Value;
-    /// Errors: what it must be, to stand behind "It must be".
+    /// Errors: what it must be, to follow "It must be".
     fn from_toml(value: &toml::Value) -> Result<Self, String>;
     /// The words that it may be, if it is one of a few.
     fn choices() -> Vec<&'static str> {
         Vec::new()
     }
-    /// Its number, if it is one: what ranges are about.
+    /// Its number, if it is one, for ranges.
     fn number(&self) -> Option<f64> {
         None
     }
@@ -118,7 +118,7 @@ impl<T: Choice> Value for T {
     }
 }
 
-/// The permitted words, to stand behind "It must be": one of these, and the nearest.
+/// The permitted words, to follow "It must be": one of these, and the nearest.
 pub(crate) fn among(value: &toml::Value, known: &[&str]) -> String {
     let near = value.as_str().and_then(|word| nearest(word, known));
     format!("one of {}{}", known.join(", "), near.map(|n| format!("; did you mean `{n}`?")).unwrap_or_default())

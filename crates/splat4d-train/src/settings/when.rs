@@ -1,4 +1,4 @@
-//! When a setting has an effect, as data, so that checks, help and documents say the same.
+//! When a setting has an effect, as data, so that checks, help and documents agree.
 
 /// A condition on other settings, which are named `table.field`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,7 +18,7 @@ pub enum When {
 }
 
 impl When {
-    /// Whether it is so; `get` looks a setting up.
+    /// Whether it holds; `get` looks a setting up.
     pub(crate) fn holds(self, get: &dyn Fn(&str) -> toml::Value) -> bool {
         match self {
             Self::Always => true,
@@ -30,7 +30,7 @@ impl When {
         }
     }
 
-    /// Every setting that it looks at.
+    /// Every setting that it reads.
     #[cfg(test)]
     pub(crate) fn keys(self) -> Vec<&'static str> {
         match self {
@@ -46,7 +46,7 @@ fn is_open(key: &str, word: &str) -> bool {
     (key, word) == ("run.motion", "auto")
 }
 
-/// Whether a value says that something is not to be: 0, false, nothing, `none` or `off`.
+/// Whether a value disables something: 0, false, nothing, `none` or `off`.
 pub(crate) fn is_off(value: &toml::Value) -> bool {
     match value {
         toml::Value::Boolean(on) => !on,
@@ -58,7 +58,7 @@ pub(crate) fn is_off(value: &toml::Value) -> bool {
 }
 
 impl std::fmt::Display for When {
-    /// Stands behind "it needs".
+    /// Follows "it needs".
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let joined = |parts: &[Self], by: &str| parts.iter().map(Self::to_string).collect::<Vec<_>>().join(by);
         match self {

@@ -21,8 +21,8 @@ pub(super) struct Batch {
 }
 
 impl Batch {
-    /// Loads the frames `seen`, at half their size where `half` states so, from where and when `corrections` say. `rng` draws the
-    /// frames to which points are followed.
+    /// Loads the frames `seen`, at half their size where `half` states so, with poses and times corrected by
+    /// `corrections`. `rng` draws the frames to which points are followed.
     pub(super) fn load(
         &mut self,
         frames: &dyn Frames,
@@ -86,8 +86,8 @@ impl Batch {
     }
 }
 
-/// The ways of the points that are seen in frame i, to another training frame of its camera that sees some of them: flow
-/// that is known in their pixels alone. `None`: no such points.
+/// The displacements of the tracked points in frame i, to another training frame of its camera that sees some of them:
+/// flow that is known in their pixels alone. `None`: no such points.
 fn tracks(frames: &dyn Frames, i: usize, half: bool, rng: Rng) -> Option<Flow> {
     let own = frames.tracked(i)?;
     let others = (0..frames.len()).filter(|&j| {

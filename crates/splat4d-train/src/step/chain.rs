@@ -1,11 +1,11 @@
 //! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
 //!
-//! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
-//! for every distinct (layer, space, time), one `finish`.
+//! Views and the queries of losses over several times are merged: one `prepare`, one `at` and one `backward` for every
+//! distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
 use crate::Result;
-use crate::loss::image::{Channel, PictureGrads, Shown};
+use crate::loss::image::{Channel, LossGrads, Shown};
 pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 pub(crate) use crate::train_state::Observation;
@@ -17,12 +17,12 @@ use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
 use splat4d::scene::{Grads, Rows, Space, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
-/// Where a step's time went.
+/// Times of a step's parts.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Timings {
     /// `prepare` and `at`.
     pub motion: Duration,
-    /// Drawing; of a device that does it all at once also comparing and the renderer's VJP.
+    /// Rendering; of a device that does it all at once also comparing and the renderer's VJP.
     pub render: Duration,
     /// Image, probe and parameter losses with their gradients.
     pub loss: Duration,
@@ -45,7 +45,7 @@ pub struct StepReport {
     pub d_cameras: Vec<[f64; 6]>,
     /// dL/d logarithm of every view's focal lengths.
     pub d_focals: Vec<f64>,
-    /// Where the time went.
+    /// Times of the parts.
     pub timings: Timings,
 }
 
@@ -59,13 +59,13 @@ impl StepReport {
 /// The input of one step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step<'a, F: Real> {
-    /// The scene to draw.
+    /// The scene to render.
     pub scene: &'a Scene<F>,
     /// The views to compare it with.
     pub views: &'a [View<'a, F>],
-    /// Where in training.
+    /// Stage and step.
     pub info: &'a StepInfo,
-    /// Highest degree of spherical harmonics drawn.
+    /// Highest degree of spherical harmonics rendered.
     pub sh_degree: usize,
 }
 
@@ -73,9 +73,9 @@ pub(crate) struct Step<'a, F: Real> {
 pub(crate) struct Losses<'a, F: Real> {
     /// Compares images.
     pub image: &'a mut dyn ImageTerm<F>,
-    /// Look at several times.
+    /// Losses over several times.
     pub probes: &'a [Box<dyn ProbeLoss<F>>],
-    /// Look at raw parameters.
+    /// Losses on raw parameters.
     pub params: &'a [Box<dyn ParamLoss<F>>],
 }
 
@@ -107,7 +107,7 @@ impl<F: Real> Work<'_, F> {
 }
 
 impl<F: Real> Chain<F> {
-    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is called with every view.
+    /// One step: adds all gradients to `d` (one per layer, cleared by the caller). `observe` is called with every view.
     ///
     /// Errors: those of the backend.
     pub(crate) fn step(
@@ -145,12 +145,12 @@ impl<F: Real> Chain<F> {
         Ok(report)
     }
 
-    /// Collects the questions: what views see is what is alive, probes add their rows, channels other times.
+    /// Collects the queries: views need the rows that are alive, probes add their rows, channels other times.
     fn request(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
         self.evaluation.begin();
         for view in step.views {
             for (index, layer) in step.scene.layers.iter().enumerate() {
-                self.evaluation.ask_active(index, layer, view.t);
+                self.evaluation.request_active(index, layer, view.t);
             }
         }
         for probe in probes.iter().flatten() {
@@ -161,25 +161,24 @@ impl<F: Real> Chain<F> {
         }
         for view in step.views {
             for t in image.needs(view).extra.iter().filter_map(|channel| channel.other_time(view)) {
-                for i in self.asked(step.scene, view.t) {
-                    self.evaluation.ask_again(i, t);
+                for i in self.queries_at(step.scene, view.t) {
+                    self.evaluation.request_again(i, t);
                 }
             }
         }
     }
 
-    /// By layer the question for its Gaussians at a time of this step.
-    fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
-        let question =
-            |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was asked");
-        (0..scene.layers.len()).map(question).collect()
+    /// By layer the query for its Gaussians at a time of this step.
+    fn queries_at(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
+        let query = |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was queried");
+        (0..scene.layers.len()).map(query).collect()
     }
 
-    /// Draws one view, compares it, and takes the gradient back to its splats.
+    /// Renders one view, compares it, and takes the gradient back to its splats.
     fn view(&mut self, step: &Step<'_, F>, view: &View<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
         let mut clock = Clock::now();
         let scene = step.scene;
-        let asked = self.asked(scene, view.t);
+        let asked = self.queries_at(scene, view.t);
         let source = Source { scene, view, asked: &asked };
         let needs = work.image.needs(view);
         let channels = Channels::new(&needs.extra, source, &self.evaluation);
@@ -215,7 +214,7 @@ impl<F: Real> Chain<F> {
         Ok(())
     }
 
-    /// Shows a loss the rows it asked for and scatters its gradient back.
+    /// Shows a loss the rows it requested and scatters its gradient back.
     fn probe(&mut self, scene: &Scene<F>, loss: &dyn ProbeLoss<F>, probes: &[Probe]) -> f64 {
         let mut places = Vec::new();
         let mut seen = Vec::new();
@@ -223,14 +222,14 @@ impl<F: Real> Chain<F> {
             let mut tables = Vec::new();
             let mut place = Vec::new();
             for &t in &probe.times {
-                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was asked");
+                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was queried");
                 let tape = self.evaluation.tape(i);
                 let index: Vec<u32> = match (tape.rows(), &probe.rows) {
                     (_, None) => (0..tape.out().rows() as u32).collect(),
                     (Rows::All, Some(rows)) => rows.clone(),
                     (Rows::Some(ids), Some(rows)) => rows
                         .iter()
-                        .map(|r| ids.binary_search(r).expect("the asked rows hold the probe's rows") as u32)
+                        .map(|r| ids.binary_search(r).expect("the requested rows contain the probe's rows") as u32)
                         .collect(),
                 };
                 tables.push(tape.out().gather(&index));
@@ -257,7 +256,7 @@ impl<F: Real> Chain<F> {
 #[derive(Default)]
 struct Compared<F> {
     image: Image<F>,
-    d_image: PictureGrads<F>,
+    d_image: LossGrads<F>,
     d_splats: RenderGrads<F>,
 }
 
@@ -269,7 +268,7 @@ impl<F: Real> Compared<F> {
         work.record_loss(value);
     }
 
-    /// Drawing, the image loss and the backend's VJP, all on its device. Returns whether it could.
+    /// Rendering, the image loss and the backend's VJP, all on its device. Returns whether it could.
     fn compare_there(
         &mut self,
         view: &View<'_, F>,

@@ -1,5 +1,5 @@
-//! Further channels of the splats of a view, so that losses can look at them: normals, the way to another time, a column of
-//! the Gaussians. Each has its forward and its VJP here.
+//! Further channels of the splats of a view, for losses: normals, the displacement to another time, a column of the
+//! Gaussians. Each has its forward and its VJP here.
 
 use crate::loss::image::{Channel, View};
 use rayon::prelude::*;
@@ -18,14 +18,14 @@ const CHUNK: usize = 512;
 pub(super) struct Source<'a, F: Real> {
     pub(super) scene: &'a Scene<F>,
     pub(super) view: &'a View<'a, F>,
-    /// By layer: the question that the view's splats answer.
+    /// By layer: the query whose results are the view's splats.
     pub(super) asked: &'a [usize],
 }
 
-/// The answers in which a layer's splats are at another time.
+/// The results in which a layer's splats are at another time.
 struct Later {
-    question: usize,
-    /// A row a splat of the view; `None`: it was not asked for.
+    query: usize,
+    /// A row per splat of the view; `None`: it was not requested.
     rows: Vec<Option<usize>>,
 }
 
@@ -33,14 +33,14 @@ struct Later {
 pub(super) struct Channels<F> {
     /// [all splats, C]
     pub(super) table: Table<F>,
-    /// The drawn channels, each with its first column.
+    /// The rendered channels, each with its first column.
     pub(super) places: Vec<(Channel, usize)>,
-    /// By channel that draws a way, by layer, where it goes.
+    /// By channel with a displacement, by layer, its target.
     later: Vec<(Channel, Vec<Later>)>,
 }
 
 impl<F: Real> Channels<F> {
-    /// Of the splats that `evaluation` has of a view. `None`: there is nothing to draw.
+    /// Of the splats that `evaluation` has of a view. `None`: there is nothing to render.
     pub(super) fn new(wanted: &[Channel], source: Source<'_, F>, evaluation: &Evaluation<F>) -> Option<Self> {
         let drawn = wanted.iter().filter(|c| match c {
             Channel::Sigmoid(column) => source.scene.layers.iter().any(|l| logit_of(&l.params, column).is_some()),
@@ -67,7 +67,7 @@ impl<F: Real> Channels<F> {
         Some(out)
     }
 
-    /// From the gradient of the table to those of the answers, and of the layers' columns.
+    /// From the gradient of the table to those of the results, and of the layers' columns.
     pub(super) fn backward(
         &self,
         d_table: &Table<F>,
@@ -95,12 +95,12 @@ impl<F: Real> Channels<F> {
     }
 
     fn flow(&mut self, column: usize, channel: &Channel, source: Source<'_, F>, evaluation: &Evaluation<F>) {
-        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let truth = channel.way(source.view).expect("only views with flow request it");
         let (mut first, mut all) = (0, Vec::new());
         for (layer, &i) in source.asked.iter().enumerate() {
             let now = evaluation.tape(i);
-            let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was asked");
-            let then = evaluation.tape(question);
+            let query = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was queried");
+            let then = evaluation.tape(query);
             let row = |id: usize| match then.rows() {
                 Rows::All => Some(id),
                 Rows::Some(ids) => ids.binary_search(&(id as u32)).ok(),
@@ -116,7 +116,7 @@ impl<F: Real> Channels<F> {
             let values = ways.iter().map(|w| w.unwrap_or([F::ZERO; 3]));
             values.enumerate().for_each(|(r, w)| self.table.write(first + r, column, w));
             first += rows.len();
-            all.push(Later { question, rows });
+            all.push(Later { query, rows });
         }
         self.later.push((channel.clone(), all));
     }
@@ -128,13 +128,13 @@ impl<F: Real> Channels<F> {
         source: Source<'_, F>,
         evaluation: &mut Evaluation<F>,
     ) {
-        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let truth = channel.way(source.view).expect("only views with flow request it");
         let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what is backpropagated was rendered");
         let mut first = 0;
         for (&i, later) in source.asked.iter().zip(all) {
             // Where the flow has no duration, it has no effect on the splats.
-            if later.question != i {
-                let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.question).out());
+            if later.query != i {
+                let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.query).out());
                 let back = |r: usize| {
                     let (to, d): (usize, [F; 2]) = (later.rows[r]?, d_table.read(first + r, column));
                     if self.table.get(first + r, column + 2) == F::ZERO || d == [F::ZERO; 2] {
@@ -149,7 +149,7 @@ impl<F: Real> Channels<F> {
                 let ends = || ways.iter().enumerate().filter_map(|(r, ends)| Some((r, ends.as_ref()?)));
                 let d_now = evaluation.d_out(i);
                 ends().for_each(|(r, (d, _))| d_now.add(r, 0, *d));
-                let d_then = evaluation.d_out(later.question);
+                let d_then = evaluation.d_out(later.query);
                 ends().for_each(|(r, (_, d))| d_then.add(later.rows[r].expect("it has an end"), 0, *d));
             }
             first += later.rows.len();
@@ -298,7 +298,7 @@ fn normal_backward<F: Real>(camera: &Camera, mean: [F; 3], cov: [F; 6], d: [F; 3
     let (gu, gv) = (dot(u, d_n), dot(v, d_n));
     let (yu, yv) = ((c * gu - b * gv) / det, (a * gv - b * gu) / det);
     let y: [f64; 3] = std::array::from_fn(|i| yu * u[i] + yv * v[i]);
-    // An off-diagonal stands for both of its places.
+    // An off-diagonal represents both of its positions.
     let pair = |i: usize, j: usize| if i == j { y[i] * n[i] } else { y[i] * n[j] + y[j] * n[i] };
     [pair(0, 0), pair(0, 1), pair(0, 2), pair(1, 1), pair(1, 2), pair(2, 2)].map(F::of)
 }

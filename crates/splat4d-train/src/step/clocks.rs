@@ -2,8 +2,8 @@
 //! camera's images
 //! are compared with the scene at shifted times, and the shift that suits them best wins.
 //!
-//! Gradients alone do not find shifts of whole frames: they look no farther than edges are wide. The scene was learnt with
-//! the wrong clocks, but of any one of them it is mostly the others' scene; so the search is repeated while it learns, as
+//! Gradients alone do not find shifts of whole frames: their reach is the width of edges. The scene was learnt with the
+//! wrong clocks, but of any one of them it is mostly the others' scene; so the search is repeated while it learns, as
 //! points and their partners are in ICP (Besl and McKay 1992).
 
 use crate::Result;
@@ -17,15 +17,15 @@ use splat4d::scene::{Planes, Time};
 use std::collections::BTreeMap;
 
 /// Images of a camera that are examined, spread over the capture.
-const LOOKS: usize = 6;
-/// Neighbouring searches look at other images: at so many places between two of them, in turn.
+const IMAGES: usize = 6;
+/// Neighbouring searches use different images: this many positions between two of them, in turn.
 const TURNS: usize = 3;
 /// Images are halved until their longer side is at most so long, pixels: that is quick, and a shift shows farther.
 const SIDE: usize = 160;
-/// A search looks no farther than this share of the clip: beyond its ends there is no scene to compare with.
+/// A search covers at most this share of the clip: beyond its ends there is no scene to compare with.
 const FARTHEST: f64 = 0.25;
 
-/// The images from which time offsets are found, and what is known of their cameras.
+/// The images from which time offsets are found, and the known data of their cameras.
 #[derive(Clone, Copy)]
 pub(crate) struct OffsetImages<'a> {
     pub frames: &'a dyn Frames,
@@ -59,7 +59,7 @@ impl OffsetImages<'_> {
         let within = |i: &usize| time(*i) + ends[0] >= scene.clip[0] && time(*i) + ends[1] <= scene.clip[1];
         let mut frames: Vec<usize> = frames.iter().copied().filter(within).collect();
         frames.sort_by(|&a, &b| time(a).total_cmp(&time(b)));
-        let looks = LOOKS.min(frames.len());
+        let looks = IMAGES.min(frames.len());
         let mut backend = device::cpu(RenderConfig { antialias: self.antialias, ..RenderConfig::default() });
         let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
         for k in 0..looks {
@@ -97,8 +97,8 @@ fn difference(drawn: &Planes<f32>, picture: &Picture) -> f64 {
     if weights > 0.0 { sum / weights } else { 0.0 }
 }
 
-/// The shift of evenly spaced ones that costs least: the vertex of the parabola through it and its neighbours. None where
-/// all cost the same.
+/// The shift of evenly spaced ones that costs least: the vertex of the parabola through it and its neighbours. None
+/// where all cost the same.
 fn least(shifts: &[f64], costs: &[f64]) -> f64 {
     let order =
         |&a: &usize, &b: &usize| costs[a].total_cmp(&costs[b]).then(shifts[a].abs().total_cmp(&shifts[b].abs()));

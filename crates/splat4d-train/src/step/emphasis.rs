@@ -1,9 +1,8 @@
-//! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most images and the hardest,
-//! since
-//! a still Gaussian learns from every frame and a moving one from those of its life.
+//! [`Emphasis`]: pixels of dynamic regions weigh more. Dynamic regions are a small part of most images and the hardest,
+//! since a still Gaussian learns from every frame and a moving one from those of its lifespan.
 //!
-//! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there and
-//! weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
+//! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there
+//! and weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
@@ -13,9 +12,9 @@ use splat4d::scene::Planes;
 use splat4d::simd::{Pass, Simd, dispatch_pass};
 use std::collections::BTreeMap;
 
-/// γ: a channel that is so far from the median counts half (K-Planes' setting of DyNeRF's for all frames).
+/// γ: at this distance from the median a channel counts half (K-Planes' setting of DyNeRF's for all frames).
 const GAMMA: f32 = 0.02;
-/// Rows of pixels of a task: fewer would cost more to hand out than to compute.
+/// Rows of pixels of a task: for fewer, scheduling would cost more than the work.
 const ROWS: usize = 16;
 
 /// Weights of pixels by how much they differ from the static background; none where cameras move, or have few images.
@@ -29,7 +28,7 @@ pub(crate) struct Emphasis {
 }
 
 impl Emphasis {
-    /// Looks at the static background. `None`: nothing is emphasised. Errors: an image cannot be read.
+    /// Computes the static background. `None`: nothing is emphasised. Errors: an image cannot be read.
     pub(crate) fn new(frames: &dyn Frames, strength: f64) -> Result<Option<Self>> {
         if strength <= 0.0 {
             return Ok(None);
@@ -118,7 +117,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn weights_follow_the_distance_from_the_median_and_what_the_lens_never_filled_has_none() {
+    fn weights_follow_the_distance_from_the_median_and_unfilled_pixels_have_none() {
         let frames = Made::new(3, 5, 24);
         let mut emphasis = Emphasis::new(&frames, 2.0).unwrap().expect("cameras stand still and have five moments");
         let load = |i: usize| {

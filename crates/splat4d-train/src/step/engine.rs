@@ -1,5 +1,5 @@
-//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
-//! place, since a plan states all that a step is of, and a learner states what happened to it between steps.
+//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can be
+//! in its place, since a plan states all that a step is of, and a learner states what happened to it between steps.
 
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
@@ -11,7 +11,7 @@ use crate::train_state::{Parts, TrainState};
 use splat4d::device;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Antialias, Backend, Wanted};
+use splat4d::render::{Abilities, Antialias, Backend};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Grads, Key, LIFE, SH};
 use std::time::{Duration, Instant as Clock};
@@ -24,11 +24,11 @@ pub struct StepPlan<'a> {
     pub loss: &'a mut TrainLoss,
     /// Images and their truth.
     pub views: &'a [View<'a, f32>],
-    /// Where in training.
+    /// Stage and step.
     pub info: &'a StepInfo,
     /// Steps of the stage that were taken before.
     pub stage_step: usize,
-    /// Highest SH degree drawn.
+    /// Highest SH degree rendered.
     pub sh_degree: usize,
     /// Every rate is multiplied by this.
     pub rate_scale: f64,
@@ -38,7 +38,7 @@ pub struct StepPlan<'a> {
     pub min_opacity: f64,
 }
 
-/// What a step measured.
+/// Measurements of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Measured {
     /// Number of the step, from 1.
@@ -58,7 +58,8 @@ pub struct Measured {
 pub struct Stepped {
     /// Timings and gradients to times and cameras; losses too, where the step is done.
     pub report: StepReport,
-    /// What steps measured that are done now and were not before: this one, or, of a device that is still at it, earlier ones.
+    /// Measurements of the steps that finished since the last call: this one, or, if the device is still busy, earlier
+    /// ones.
     pub measured: Vec<Measured>,
     /// Loading images.
     pub load: Duration,
@@ -68,11 +69,11 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
-    /// What the user should know of the device that draws.
+    /// A message for the user about the rendering device.
     pub notices: Vec<String>,
 }
 
-/// What a step was spoilt by.
+/// Cause of an invalid step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Blame {
     /// A number that is not finite: smaller steps may help.
@@ -81,19 +82,19 @@ pub enum Blame {
     Device,
 }
 
-/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the numbers of the
-/// frames that it examined, where it is not the last one that was begun.
+/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the
+/// numbers of the frames that it examined, where it is not the last one that was begun.
 #[derive(Clone, Debug)]
 pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it, or one before it,
-    /// was spoilt. Errors: those of what draws.
+    /// One step: evaluate, render, compare, backward, Adam, noise. A device may still be busy with it afterwards. Inner
+    /// error: it, or one before it, was spoilt. Errors: those of what renders.
     fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
-    /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is remembered
-    /// of it is stale.
+    /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is
+    /// remembered of it is stale.
     fn changed(&mut self, train_state: &TrainState);
 
     /// Waits for the steps that a device is still at: what they measured. Errors: one was spoilt.
@@ -112,7 +113,7 @@ pub trait Engine: Send {
         Vec::new()
     }
 
-    /// As it draws.
+    /// As it renders.
     fn antialias(&self) -> Antialias;
 }
 
@@ -139,14 +140,14 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
     }
 }
 
-/// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that falls from the
-/// start leaves them short in runs of a few dozen images a camera (docs/suite.md).
+/// Share of a stage after which exposures are frozen: before it they learn at a constant rate, since a rate that falls
+/// from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
-/// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient, and at the
-/// full rate images end a thousandth off.
+/// Remaining share of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the
+/// gradient, and at the full rate images end a thousandth off.
 const EXPOSURE_END: f64 = 0.01;
 
-/// What is left of the exposures' rate at a place in the stage.
+/// Remaining share of the exposures' rate at a point of the stage.
 fn rests(progress: f64) -> f64 {
     EXPOSURE_END.powf(((progress - EXPOSURE_RESTS) / (1.0 - EXPOSURE_RESTS)).max(0.0))
 }
@@ -168,7 +169,7 @@ fn learn_exposure(train_state: &mut TrainState, plan: &StepPlan<'_>) {
     }
 }
 
-/// The rate of a layer's positions, by which noise on them goes; none: they rest.
+/// The rate of a layer's positions, which scales their noise; none: they are frozen.
 pub(super) fn noise_rate(plan: &StepPlan<'_>, layer: usize) -> Option<f64> {
     let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
     Some(group.rate.at(plan.info.progress) * plan.stage.settled(plan.info.progress))
@@ -179,7 +180,7 @@ pub(super) fn noise_stream(plan: &StepPlan<'_>) -> Rng {
     Rng::new(plan.info.seed, "noise", plan.info.iteration as u64)
 }
 
-/// Steps on the processor, with whatever draws.
+/// Steps on the processor, with whatever renders.
 pub struct CpuEngine<'a> {
     backend: Box<dyn Backend<f32> + 'a>,
     chain: Chain<f32>,
@@ -190,12 +191,12 @@ pub struct CpuEngine<'a> {
     shown: Scene<f32>,
     /// Whether `shown` is to be copied from the scene again.
     stale: bool,
-    /// Whether it was said that images are compared on the CPU.
+    /// Whether it was reported that images are compared on the CPU.
     told: bool,
 }
 
 impl<'a> CpuEngine<'a> {
-    /// An engine that draws with `backend`.
+    /// An engine that renders with `backend`.
     pub fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         Self {
             backend,
@@ -208,12 +209,12 @@ impl<'a> CpuEngine<'a> {
         }
     }
 
-    /// What draws.
+    /// The renderer.
     pub(super) fn backend(&mut self) -> &mut (dyn Backend<f32> + 'a) {
         self.backend.as_mut()
     }
 
-    /// Draws on the processor from now on, by the same limits.
+    /// Renders on the processor from now on, by the same limits.
     pub(super) fn leave_device(&mut self) {
         self.backend = device::cpu(*self.backend.config());
     }
@@ -228,7 +229,7 @@ impl<'a> CpuEngine<'a> {
         codec.show(scene, &plan.info.times, &mut self.shown);
     }
 
-    /// Evaluate, draw, compare, and all the backward pass: fills the gradients.
+    /// Evaluate, render, compare, and all the backward pass: fills the gradients.
     fn evaluate(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
         let Parts { scene, stats, exposure, .. } = train_state.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
@@ -284,7 +285,7 @@ impl<'a> CpuEngine<'a> {
         Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite"), Blame::Numbers, None))
     }
 
-    /// Noise on positions, where the stage has it.
+    /// Noise on positions, if the stage has it.
     fn add_noise(&self, train_state: &mut TrainState, plan: &StepPlan<'_>) {
         let Some(noise) = plan.stage.noise else { return };
         let (rate, rng) = (|layer: usize| noise_rate(plan, layer), noise_stream(plan));
@@ -294,7 +295,7 @@ impl<'a> CpuEngine<'a> {
 
 /// Whether a backend compares images, where the loss lets it.
 fn compares(backend: &dyn Backend) -> bool {
-    backend.can(&Wanted { compare: true, ..Wanted::default() }).is_ok()
+    backend.can(&Abilities { compare: true, ..Abilities::default() }).is_ok()
 }
 
 impl Engine for CpuEngine<'_> {

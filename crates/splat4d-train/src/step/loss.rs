@@ -1,14 +1,14 @@
 //! The trainer's image loss: a list of terms, on images as their cameras expose them.
 
-use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Needs, Shown, View};
 use crate::loss::photometric::Photometric;
 use crate::loss::terms::StepInfo;
 use crate::train_state::Exposure;
 use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 
-/// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the
-/// view's camera is between the drawn image and all of them.
+/// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the view's
+/// camera is between the rendered image and all of them.
 pub struct TrainLoss {
     terms: Vec<Box<dyn ImageTerm>>,
     exposed: Planes<f32>,
@@ -72,7 +72,7 @@ impl ImageTerm for StepLoss<'_> {
         needs
     }
 
-    fn eval(&mut self, info: &StepInfo, view: &View<'_>, drawn: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &View<'_>, drawn: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let run = &mut *self.run;
         let mut shown = *drawn;
         if let Some(exposure) = &self.exposure {
@@ -95,7 +95,7 @@ impl ImageTerm for StepLoss<'_> {
     }
 
     fn target<'a>(&self, view: &View<'a>) -> Option<Target<'a>> {
-        let mut terms = self.run.terms.iter().chain(&*self.stage).filter(|term| term.looks_at(view));
+        let mut terms = self.run.terms.iter().chain(&*self.stage).filter(|term| term.applies_to(view));
         let (Some(only), None) = (terms.next(), terms.next()) else { return None };
         let response = self.exposure.as_ref().map(|exposure| exposure.response(view.rig));
         only.target(view).map(|target| Target { response, ..target })
@@ -104,7 +104,7 @@ impl ImageTerm for StepLoss<'_> {
     fn compared(&mut self, view: &View<'_>, comparison: &Comparison) -> f64 {
         let run = &mut *self.run;
         let mut total = 0.0;
-        for term in run.terms.iter_mut().chain(&mut *self.stage).filter(|term| term.looks_at(view)) {
+        for term in run.terms.iter_mut().chain(&mut *self.stage).filter(|term| term.applies_to(view)) {
             total += term.compared(view, comparison);
             if let Some(measured) = term.measured() {
                 (run.l1, run.ssim) = (measured.l1, measured.ssim);
@@ -146,7 +146,7 @@ mod tests {
             Needs { depth: false, extra: vec![Channel::Normals] }
         }
 
-        fn eval(&mut self, _: &StepInfo, _: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+        fn eval(&mut self, _: &StepInfo, _: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
             *self.seen.lock().unwrap() = shown.color.data.clone();
             d.color.add().data.iter_mut().enumerate().for_each(|(i, d)| *d += weight(i));
             shown.color.data.iter().enumerate().map(|(i, x)| f64::from(x * weight(i))).sum()
@@ -167,7 +167,7 @@ mod tests {
         exposure
     }
 
-    /// Value and gradient to the drawn colours of one view.
+    /// Value and gradient to the rendered colours of one view.
     fn eval(
         loss: &mut TrainLoss,
         stage: &mut [Box<dyn ImageTerm>],
@@ -190,7 +190,7 @@ mod tests {
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
         let image = Image { color: color.clone(), ..Image::default() };
-        let mut d = PictureGrads::default();
+        let mut d = LossGrads::default();
         d.begin(&image);
         let mut step = loss.of_step(stage, Some(exposure));
         assert!(!step.needs(&view).depth);

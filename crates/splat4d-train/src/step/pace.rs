@@ -1,16 +1,17 @@
-//! [`Pace`]: how fast a run goes through its schedule.
+//! [`Pace`]: how fast a run proceeds through its schedule.
 //!
-//! All that depends on a run's length (rates, densification, resolution, degrees of SH, stages) is stated in steps of its
-//! *schedule*, of which there are `run.iterations`. A step of the run is one of the schedule, until the run is
-//! planned again:
-//! from then on what is left of the schedule is spread evenly over the steps that are left. Where these are fewer, a step
-//! passes over several steps of the schedule, and everything that was due at any of them is done once, after it; where they
-//! are more, some steps stay where they are. So nothing of the past changes its meaning, a rate goes on from where it
-//! was, densifications neither get lost nor are repeated, and the same changes of plan give the same bits.
+//! All that depends on a run's length (rates, densification, resolution, degrees of SH, stages) is stated in steps of
+//! its *schedule*, of which there are `run.iterations`. A step of the run is one of the schedule, until the run is
+//! planned again: from then on what is left of the schedule is spread evenly over the steps that are left. Where these
+//! are fewer, a step passes over several steps of the schedule, and everything that was due at any of them is done
+//! once, after it; where they are more, some steps stay where they are. So nothing of the past changes its meaning, a
+//! rate continues from where it was, densifications neither get lost nor are repeated, and the same changes of plan
+//! give the same bits.
 
 use super::replans::ScheduleChange;
 
-/// How many steps of the schedule are behind a run after so many steps of its own: a pure function of the changes of plan.
+/// How many steps of the schedule are behind a run after this many steps of its own: a pure function of the changes of
+/// plan.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Pace {
     /// Steps of the schedule.
@@ -19,7 +20,7 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// The pace of a run whose schedule has so many steps.
+    /// The pace of a run whose schedule has this many steps.
     pub(crate) fn new(schedule: usize, replans: &[ScheduleChange]) -> Self {
         let mut pace = Self { schedule, rows: Vec::new() };
         for row in replans {
@@ -67,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_of_the_schedule_is_spread_over_the_steps_that_are_left() {
+    fn the_remaining_schedule_is_spread_over_the_remaining_steps() {
         let steady = Pace::new(100, &[]);
         assert!((0..=100).all(|i| steady.done_after(i) == i) && steady.total() == 100);
         // Half as many steps from the 20th on: two at a time.
@@ -77,11 +78,11 @@ mod tests {
         let slow = Pace::new(100, &[row(20, 60), row(40, 120)]);
         assert_eq!([40, 41, 42, 43, 119, 120].map(|i| slow.done_after(i)), [60, 60, 61, 61, 99, 100]);
         assert_eq!([fast.total(), slow.total()], [60, 120]);
-        // A change that comes when nothing is left changes nothing.
+        // A change when no step is left changes nothing.
         assert_eq!(Pace::new(10, &[row(10, 30)]).total(), 10);
     }
 
-    /// The schedule is gone through in order, to its end and with the last step only, and in equal parts.
+    /// The schedule is processed in order, to its end and with the last step only, and in equal parts.
     #[test]
     fn every_replanning_continues_the_schedule() {
         for rows in [vec![row(1, 2)], vec![row(7, 900), row(8, 30)], vec![row(99, 100), row(150, 151)]] {

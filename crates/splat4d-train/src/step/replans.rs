@@ -1,8 +1,8 @@
-//! `run.replans`: changes of a run's length while it goes, as they were made.
+//! `run.replans`: changes of a run's length during the run, in order.
 
 use crate::settings::Value;
 
-/// A change of a run's length while it goes.
+/// A change of a run's length during the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ScheduleChange {
     /// Steps that had been taken.
@@ -15,7 +15,7 @@ pub struct ScheduleChange {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ScheduleChanges(Vec<ScheduleChange>);
 
-/// The form of the setting, to stand behind "It must be".
+/// The form of the setting, to follow "It must be".
 const FORM: &str = "a list of [step, steps in all], steps ascending and below the steps in all, such as [[700, 4200]]";
 
 impl ScheduleChanges {

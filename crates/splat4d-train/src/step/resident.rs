@@ -1,5 +1,5 @@
-//! [`DeviceEngine`]: steps on a device that keeps the tables, where a stage lets it; all others are the CPU's, with whatever
-//! draws.
+//! [`DeviceEngine`]: steps on a device that keeps the tables, where a stage lets it; all others are the CPU's, with
+//! whatever renders.
 
 use super::chain::ImageTerm;
 use super::engine::{
@@ -21,7 +21,7 @@ use splat4d::scene::{Key, LIFE, LifeKind};
 use std::collections::VecDeque;
 use std::time::Instant as Clock;
 
-/// Who has the newest numbers.
+/// Owner of the newest numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Newest {
     /// The learner: what a device keeps is stale.
@@ -33,7 +33,7 @@ enum Newest {
 }
 
 /// A step that the device is still at.
-struct UnderWay {
+struct InFlight {
     /// From 1.
     iteration: usize,
     /// Share of D-SSIM in the loss, by view, and the frames.
@@ -45,21 +45,21 @@ struct UnderWay {
 pub(crate) struct DeviceEngine<'a> {
     cpu: CpuEngine<'a>,
     newest: Newest,
-    /// Whether the device has failed, or has no room.
+    /// Whether the device has failed or is out of memory.
     given_up: bool,
-    /// Whether it was said that the CPU keeps the tables.
+    /// Whether it was reported that the CPU keeps the tables.
     told: bool,
     /// See [`rates_of`].
     rates: Rates,
     /// Tables that are kept, by layer.
     known: Vec<ResidentMotion>,
-    under_way: VecDeque<UnderWay>,
+    under_way: VecDeque<InFlight>,
     /// Measurements of finished steps, not reported yet.
     ready: Vec<Measured>,
 }
 
 impl<'a> DeviceEngine<'a> {
-    /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
+    /// An engine that renders with `backend`, and takes steps with it where it keeps tables.
     pub(crate) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
         Self {
@@ -101,7 +101,7 @@ impl<'a> DeviceEngine<'a> {
         }))
     }
 
-    /// Hands the tables over, if what is kept is stale.
+    /// Uploads the tables if the device's copy is stale.
     fn keep(&mut self, train_state: &TrainState, plan: &StepPlan<'_>) -> Result<()> {
         if self.newest != Newest::TrainState {
             return Ok(());
@@ -122,10 +122,10 @@ impl<'a> DeviceEngine<'a> {
         Ok(())
     }
 
-    /// Remembers what steps measured that are done. Errors: one was spoilt.
+    /// Stores the measurements of finished steps. Errors: one is invalid.
     fn take_in(&mut self, train_state: &TrainState, done: Vec<ResidentStepped>) -> std::result::Result<(), Fault> {
         for stepped in done {
-            let UnderWay { iteration, dssim, frames } =
+            let InFlight { iteration, dssim, frames } =
                 self.under_way.pop_front().expect("what is done was begun before");
             let views = dssim.len();
             let mut now = Measured { iteration, loss: stepped.loss, ..Measured::default() };
@@ -150,7 +150,7 @@ impl<'a> DeviceEngine<'a> {
         Ok(())
     }
 
-    /// The fault of a device that failed with the only numbers, and is left for good.
+    /// The fault of a device that failed with the only numbers, and is not used again.
     fn gone(&mut self, why: &str) -> Fault {
         self.given_up = true;
         self.cpu.leave_device();
@@ -182,7 +182,7 @@ fn kept<'a>(
     }
 }
 
-/// What a device knows of all layers for a step, or why the step is the CPU's.
+/// All layers of a step for a device, or the reason why the CPU takes the step.
 fn known(
     train_state: &TrainState,
     plan: &StepPlan<'_>,
@@ -213,7 +213,7 @@ fn known(
         }
         all.push(known);
     }
-    // Ties go by the poses of a frame, of Gaussians that are all there.
+    // Ties use the poses of a frame of all Gaussians.
     let posed = all.iter().zip(&scene.layers).all(|(k, l)| k.moves == Moves::Posed && l.life == LifeKind::Infinite);
     let knows = |kept: Option<ResidentLoss>| match kept {
         Some(ResidentLoss::Rows(_)) => true,
@@ -295,7 +295,7 @@ impl Engine for DeviceEngine<'_> {
         }
         let clock = Clock::now();
         if let Err(error) = self.keep(train_state, plan) {
-            // It may well go on drawing.
+            // It may well continue rendering.
             self.given_up = true;
             self.report(&error.cause(), &mut notices);
             return self.step_on_cpu(train_state, plan, notices);
@@ -320,7 +320,7 @@ impl Engine for DeviceEngine<'_> {
         let resident = self.cpu.backend().resident().expect("it was there before");
         let done = match resident.step(&step) {
             Ok(Some(done)) => done,
-            // An image too large for one piece: the CPU's engine draws it in several.
+            // An image too large for one buffer: the CPU's engine renders it in several.
             Ok(None) => return self.step_on_cpu(train_state, plan, notices),
             Err(error) => {
                 if self.newest != Newest::Both {
@@ -330,17 +330,17 @@ impl Engine for DeviceEngine<'_> {
                 self.given_up = true;
                 self.newest = Newest::TrainState;
                 if error.kind() == ErrorKind::Memory {
-                    // Drawing needs less of it.
+                    // Rendering needs less of it.
                     self.report(&error.cause(), &mut notices);
                 } else {
                     self.cpu.leave_device();
-                    notices.push(format!("training goes on on the CPU: {}", error.cause()));
+                    notices.push(format!("training continues on the CPU: {}", error.cause()));
                 }
                 return self.step_on_cpu(train_state, plan, notices);
             }
         };
         self.newest = Newest::Device;
-        self.under_way.push_back(UnderWay {
+        self.under_way.push_back(InFlight {
             iteration: plan.info.iteration + 1,
             dssim: views.iter().map(|v| v.target.dssim).collect(),
             frames: plan.views.iter().map(|v| v.frame).collect(),

@@ -30,7 +30,7 @@ impl Made {
     /// The ball's radius.
     pub(crate) const RADIUS: f64 = 0.5;
 
-    /// `cameras` square images of `size` pixels at each of `times` moments, 10 a second.
+    /// `cameras` square images of `size` pixels at each of `times` times, 10 per second.
     pub(crate) fn new(cameras: usize, times: usize, size: usize) -> Self {
         let camera = |i: usize| {
             let a = std::f64::consts::TAU * i as f64 / cameras as f64;
@@ -40,7 +40,7 @@ impl Made {
         Self { cameras: (0..cameras).map(camera).collect(), times }
     }
 
-    /// The k-th moment, seconds.
+    /// The k-th time, seconds.
     pub(crate) fn time_of(&self, k: usize) -> f64 {
         k as f64 * 0.1
     }

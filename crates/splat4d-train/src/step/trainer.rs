@@ -53,22 +53,22 @@ pub struct Position {
     pub stage_step: usize,
     /// Steps taken in it.
     pub taken: usize,
-    /// Whether the last step left the place in the schedule as it was: what is due there was done.
+    /// Whether the last step left the position in the schedule as it was: what is due there was done.
     pub rests: bool,
     /// Every rate is multiplied by this; halved after a rollback.
     pub rate_scale: f64,
-    /// Rollbacks so far.
+    /// Number of rollbacks.
     pub strikes: usize,
 }
 
-/// The device that draws.
+/// The device that renders.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainedOn {
     /// It in words, its driver too.
     pub(crate) name: String,
-    /// What was taken and why, in a line.
+    /// The choice and its reason, in one line.
     pub(crate) why: String,
-    /// Whether it is not the one that was asked for.
+    /// Whether it is not the one that was queried for.
     pub(crate) missed: bool,
 }
 
@@ -84,11 +84,11 @@ pub struct Trainer<'a> {
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
-    /// What draws.
+    /// The renderer.
     pub(crate) device: TrainedOn,
     /// The pace through the schedule; none: a step is one of the schedule.
     pace: Option<Pace>,
-    /// Whether what comes before the step is done already.
+    /// Whether the work before the step is done.
     entered: bool,
     frames: Arc<dyn Frames>,
     timeline: Timeline,
@@ -142,7 +142,7 @@ impl<'a> Trainer<'a> {
         self.batch.emphasis = emphasis;
     }
 
-    /// Looks at other frames, of the same times, from now on.
+    /// Uses other frames, of the same times, from now on.
     #[cfg(test)]
     pub(crate) fn set_frames(&mut self, frames: Arc<dyn Frames>) {
         self.frames = frames;
@@ -158,18 +158,18 @@ impl<'a> Trainer<'a> {
         self.stages.iter().map(|s| s.iterations).sum()
     }
 
-    /// Goes through the schedule at the pace of these changes of plan: all that were ever made.
+    /// Follows the schedule at the pace of these changes of plan, which are all that were ever made.
     pub(crate) fn replan(&mut self, replans: &[ScheduleChange]) {
         self.pace = (!replans.is_empty()).then(|| Pace::new(self.schedule(), replans));
     }
 
-    /// Changes of plan that were followed in the first `taken` steps: the step at which each came, and the steps in all.
+    /// Changes of plan that were followed in the first `taken` steps: the step of each, and the steps in all.
     pub(crate) fn replans_before(&self, taken: usize) -> Vec<[usize; 2]> {
         self.pace.as_ref().map_or_else(Vec::new, |p| p.replans_before(taken))
     }
 
-    /// Steps of the current stage's schedule that will be behind the run after this step: at most to the stage's end, so
-    /// that no stage is passed over.
+    /// Steps of the current stage's schedule that will be behind the run after this step: at most to the stage's end,
+    /// so that no stage is passed over.
     fn next_place(&self) -> usize {
         let Position { iteration, stage, stage_step, .. } = self.progress;
         match &self.pace {
@@ -226,8 +226,8 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Does what is due before the next step, through stages without steps. [`step`](Self::step) does so by itself, but
-    /// notifies nothing.
+    /// Does the work that is due before the next step, through stages without steps. [`step`](Self::step) does so by
+    /// itself, but notifies nothing.
     pub(crate) fn enter(&mut self, progress: &mut Progress<'_>) -> Result<()> {
         while !self.entered && !self.is_done() {
             if self.progress.stage_step == 0 {
@@ -306,7 +306,7 @@ impl<'a> Trainer<'a> {
         self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
-        if self.looked_at_after(place + 1..=next) {
+        if self.read_after(place + 1..=next) {
             match self.settle() {
                 Ok(measured) => out.measured.extend(measured),
                 Err(fault) => return Ok(Err(fault)),
@@ -329,7 +329,7 @@ impl<'a> Trainer<'a> {
 
     /// Brings the learner up to date, which a device may keep: before it is read between steps. It is so by itself at
     /// the end of every stage. Returns what steps measured that were not done yet. Errors: its numbers are lost, and
-    /// the run must go back to a checkpoint.
+    /// the run must return to a checkpoint.
     pub(crate) fn settle(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
         self.engine.settle(&mut self.train_state).map_err(|fault| self.named(fault))
     }
@@ -340,7 +340,7 @@ impl<'a> Trainer<'a> {
         self.engine.catch_up(&self.train_state).map_err(|fault| self.named(fault))
     }
 
-    /// Goes on from what the learner holds, whatever a device that failed had in addition.
+    /// Continues with the learner's state, without later steps of a failed device.
     pub(crate) fn go_on(&mut self) {
         self.engine.changed(&self.train_state);
     }
@@ -361,8 +361,8 @@ impl<'a> Trainer<'a> {
         Fault(format!("{what} ({})", names.join(", ")), blame, None)
     }
 
-    /// Whether maintenance, a hook or another stage looks at the learner after these steps of the stage's schedule.
-    fn looked_at_after(&self, mut passed: RangeInclusive<usize>) -> bool {
+    /// Whether maintenance, a hook or another stage reads the learner after these steps of the stage's schedule.
+    fn read_after(&self, mut passed: RangeInclusive<usize>) -> bool {
         let stage = &self.stages[self.progress.stage];
         let last = *passed.end() == stage.iterations;
         last || passed.any(|step| stage.maintenance.iter().any(|u| u.due(&At { step, steps: stage.iterations })))
@@ -417,7 +417,7 @@ impl<'a> Trainer<'a> {
         self.engine.step(&mut self.train_state, &mut plan)
     }
 
-    /// Corrects cameras by what the step's views say, and searches their clocks where that is due.
+    /// Corrects cameras by the gradients of the step's views, and searches their time offsets where that is due.
     fn correct(&mut self, stepped: &Stepped) -> Result<()> {
         let Position { stage, stage_step, rate_scale, .. } = self.progress;
         let before: usize = self.stages[..stage].iter().map(|s| s.iterations).sum();
@@ -437,8 +437,8 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where
-    /// they are due last, and notifies losses of what they did.
+    /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and
+    /// where they are due last, and notifies losses of what they did.
     fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Maintenance) -> bool) -> Result<Change> {
         let Stage { maintenance, groups, iterations, .. } = &mut self.stages[self.progress.stage];
         let at = |step| At { step, steps: *iterations };

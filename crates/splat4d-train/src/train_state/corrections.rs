@@ -1,10 +1,10 @@
-//! `Corrections`: what training learns of where cameras stand and when they looked.
+//! `Corrections`: learnt corrections of camera poses and times.
 //!
-//! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
-//! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of
-//! all times of a camera. Images say nothing of where the scene as a whole
-//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
-//! stay. The median, since of a rig with one clock that is wrong the others are right.
+//! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
+//! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
+//! of all times of a camera. Images carry no information about the scene's absolute position, how large it is and when
+//! it begins: the cameras' mean motion, their mean growth and the median of their clocks stay. The median, since of a
+//! rig with one clock that is wrong the others are right.
 
 use crate::optim::step_row;
 use crate::settings::settings;
@@ -59,18 +59,18 @@ settings! {
 
 /// Terms of the exponential's series: twists are small, and below one radian the next term is lost in rounding.
 const TERMS: usize = 16;
-/// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that are
-/// hardly different each has its own.
+/// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that
+/// are hardly different each has its own.
 const APART: f64 = 1e-6;
 
-/// Share by which a correction of a focal length falls back in every step: what images do not ask for goes away. Our
-/// choice, not swept.
+/// Share by which a correction of a focal length falls back in every step: changes without support in the images decay.
+/// Our choice, not swept.
 const PULL: f64 = 1e-4;
 /// Largest correction of a focal length, a share of it.
 const FOCAL_LIMIT: f64 = 0.2;
-/// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to go on. Not swept.
+/// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to continue. Not swept.
 const SEARCHED: f64 = 0.5;
-/// Searches that look as far as clocks may be wrong, in whole frames; later ones look about in halves.
+/// Searches over the whole range of time offsets, in frames; later ones search locally in halves.
 const WIDE_SEARCHES: usize = 3;
 /// Reach and distance of shifts of the later searches, frames.
 const NARROW: [f64; 2] = [1.5, 0.5];
@@ -78,14 +78,14 @@ const NARROW: [f64; 2] = [1.5, 0.5];
 /// Columns of a table of numbers with their moments.
 const POSE: usize = 6;
 
-/// What is known of a frame that is corrected.
+/// Data of a corrected frame.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Origin<'a> {
     /// The number of its camera.
     pub rig: usize,
     /// Whether that camera has one pose.
     pub fixed: bool,
-    /// As the capture has it.
+    /// As in the capture.
     pub camera: &'a Camera,
 }
 
@@ -139,7 +139,7 @@ pub struct Corrections {
     rows: Vec<usize>,
     /// By frame: its camera.
     rigs: Vec<usize>,
-    /// By row: the pose that the capture states, and a frame that has it.
+    /// By row: the capture's pose, and a frame with it.
     origins: Vec<(Se3, usize)>,
     /// Values 6, moments 12, steps 1; by row.
     poses: Option<Table<f32>>,
@@ -292,7 +292,7 @@ impl Corrections {
         }
     }
 
-    /// The search of clocks that is due where the run comes from one share of itself to another.
+    /// The search of clocks that is due between two shares of the run.
     pub(crate) fn search_due(&self, before: f64, after: f64) -> Option<SearchDue> {
         self.times.as_ref()?;
         let (from, rounds) = (self.settings.times_from, self.settings.searches);
@@ -307,7 +307,7 @@ impl Corrections {
         SearchDue { round, reach: reach * self.scale.frame, step: step * self.scale.frame }
     }
 
-    /// Shifts the clocks of cameras by so many seconds. What gradients said of them before holds no longer.
+    /// Shifts the clocks of cameras by this many seconds. Their earlier gradients no longer apply.
     pub(crate) fn shift(&mut self, shifts: &[(usize, f64)]) {
         let limit = (self.settings.time_limit * self.scale.frame) as f32;
         let Some(times) = &mut self.times else { return };
@@ -360,7 +360,7 @@ impl Corrections {
         }
     }
 
-    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` returns of a frame: its
+    /// The learnt values, one row per camera (or image of a moving one), as plain data. `name` returns of a frame: its
     /// camera's name, and its number where that camera moves.
     pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
         let row = |(row, (_, frame)): (usize, &(Se3, usize))| {

@@ -10,15 +10,16 @@ use splat4d::simd::{Kernel, Simd, dispatch, each};
 const COLUMNS: usize = 12;
 /// The first offset.
 const OFFSET: usize = 9;
-/// Pixels of a piece of parallel work: sums are by piece and in order, so that they do not depend on the threads.
+/// Pixels of a piece of parallel work: sums are per piece and in order, so that they do not depend on the threads.
 const PIECE: usize = 8192;
 /// Pixels that are computed together: a register of AVX-512.
 const LANES: usize = 16;
 /// Groups of [`LANES`] pixels after which a lane's sums in f32 are added to those in f64.
 const RUN: usize = 32;
 
-/// A colour matrix I + M and an offset c a camera: the colour x that is drawn is shown as (I + M)x + c. The mean over the
-/// cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are drawn with them.
+/// A colour matrix I + M and an offset c a camera: the colour x that is rendered is shown as (I + M)x + c. The mean
+/// over the cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are
+/// rendered with them.
 /// Source: FreeTimeGS++ 2026 (an affine colour correction a camera); the fixed mean is ours.
 #[derive(Debug)]
 pub struct Exposure {
@@ -53,7 +54,7 @@ fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mu
     cut(red).zip(cut(green)).zip(cut(blue)).map(|((r, g), b)| [r, g, b])
 }
 
-/// Shows the colours of a piece in place.
+/// Applies the exposure to a piece in place.
 fn respond(row: &[f32; COLUMNS], [r, g, b]: [&mut [f32]; 3]) {
     for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
         [*r, *g, *b] = shown(row, [*r, *g, *b]);
@@ -153,7 +154,7 @@ impl Exposure {
         pieces(color).for_each(|colors| respond(&row, colors));
     }
 
-    /// Writes the colours that camera `rig` shows of what was drawn.
+    /// Writes the colours that camera `rig` shows of what was rendered.
     pub(crate) fn show(&self, rig: usize, drawn: &Planes<f32>, out: &mut Planes<f32>) {
         let row = self.response(rig);
         if (out.channels, out.height, out.width) != (drawn.channels, drawn.height, drawn.width) {
@@ -168,8 +169,8 @@ impl Exposure {
         });
     }
 
-    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the shown colours into that to the
-    /// drawn ones, and adds to the camera's.
+    /// The VJP of [`respond`](Self::respond) at what was rendered: turns the gradient to the shown colours into that to
+    /// the rendered ones, and adds to the camera's.
     pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
         let (row, simd) = (self.response(rig), Simd::detect());
         let sums: Vec<[f64; COLUMNS]> = pieces(d_color)
@@ -211,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_have_the_gradient_of_what_is_shown() {
+    fn colours_have_the_gradient_of_the_shown_image() {
         let (row, x, d) = (random::<COLUMNS>("row"), random::<3>("x"), random::<3>("d"));
         let value = |row: &[f64; COLUMNS], x: [f64; 3]| -> f64 {
             shown(row, x).iter().zip(d).map(|(shown, d)| shown * d).sum()

@@ -1,12 +1,11 @@
-//! Where every pixel of one image is in the next: least squares of the differences of small patches that overlap,
-//! coarse to
-//! fine (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", without the variational step).
+//! Dense optical flow from one image to the next: least squares of the differences of small patches that overlap,
+//! coarse to fine (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", without the variational step).
 
 use super::raster::{blurred, every_second, sample};
 use rayon::prelude::*;
 use splat4d::scene::Planes;
 
-/// Shorter side of the smallest image, pixels: patches must have room to move.
+/// Shorter side of the smallest image, pixels: patches must be able to move.
 const SMALLEST: usize = 56;
 /// Images of falling size; motion of up to some 30 pixels is followed.
 const LEVELS: usize = 4;
@@ -42,8 +41,8 @@ const STRIDE: usize = 4;
 const PATCH_STEPS: usize = 16;
 /// Differences below this, of images in [0, 1], weigh alike where patches overlap (one grey level there).
 const GREY_LEVEL: f32 = 1.0 / 255.0;
-/// Forward and backward flow agree if |F + B|² is below this share of |F|² + |B|² and so many squared pixels (Sundaram et
-/// al. 2010).
+/// Forward and backward flow agree if |F + B|² is below this share of |F|² + |B|² and this many squared pixels
+/// (Sundaram et al. 2010).
 const AGREE_SHARE: f32 = 0.01;
 const AGREE_PIXELS: f32 = 0.5;
 
@@ -121,7 +120,7 @@ fn one_way(from: &Pyramid, to: &Pyramid) -> Field {
                 search(a, b, [x, y], &[begin(x + middle, y + middle)])
             })
             .collect();
-        // What a neighbour found may be better: small things that move fast are lost on coarse levels here and there.
+        // A neighbour's result may be better: small fast objects are lost on coarse levels.
         for pass in 0..2 {
             let old = patches.clone();
             patches = (0..old.len())
@@ -186,7 +185,7 @@ fn search(a: &Planes<f32>, b: &Planes<f32>, at: [usize; 2], begins: &[[f32; 2]])
     let half = 0.5 * (xx + yy);
     let least = half - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
     let textured = least >= CORNER * N as f32;
-    // Along an edge nothing holds the patch: what the coarser level said stays.
+    // Along an edge nothing holds the patch: the coarser level's result stays.
     let ridge = CORNER * N as f32;
     let (hxx, hyy) = (xx + ridge, yy + ridge);
     let det = hxx * hyy - xy * xy;
@@ -308,7 +307,7 @@ mod tests {
         let (median, most) = (errors[errors.len() / 2], errors[errors.len() * 95 / 100]);
         assert!(median < 0.06 && most < 0.5, "half of all within {median} px, 95 % within {most} px");
         assert!(inner[inner.len() / 2] < 0.1, "{} px", inner[inner.len() / 2]);
-        // What the patch covers in the second image goes nowhere.
+        // The patch's target in the second image has no flow.
         let hidden = |x: usize, y: usize| flow.plane(2)[y * 160 + x];
         let gone = (52..58).flat_map(|x| (52..78).map(move |y| hidden(x, y))).sum::<f32>();
         assert!(gone < 0.5 * 6.0 * 26.0, "{gone} of 156 pixels that are hidden");

@@ -20,9 +20,10 @@ pub(crate) struct Track {
 
 /// Neighbours with which a camera is compared, at most.
 const NEIGHBOURS: usize = 10;
-/// Cameras whose axes are farther apart see other sides of things, degrees.
+/// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 70.0;
-/// Depths at which two cameras should see the same, of the distance between them: they are then seen at 40 to 3 degrees.
+/// Depths at which two cameras should see the same, of the distance between them: they are then seen at 40 to 3
+/// degrees.
 const DEPTHS: [f64; 4] = [1.4, 3.0, 8.0, 19.0];
 /// Of the probed pixels at the best of these depths, the least that the other camera should hold.
 const OVERLAP: f64 = 0.3;
@@ -32,8 +33,8 @@ const OFF: f64 = 1.5;
 /// this states less than in a whole image: points that only two cameras see must have more.
 const RATIO: f64 = 0.8;
 const RATIO_OF_TWO: f64 = 0.7;
-/// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at most
-/// 2 x 512². An eighth of it.
+/// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at
+/// most 2 x 512². An eighth of it.
 const FAR: u32 = 65_536;
 /// Least angle between the outermost rays of a point, degrees.
 const NARROW: f64 = 1.5;
@@ -88,7 +89,7 @@ pub(crate) fn pairs(cameras: &[&Camera]) -> Vec<[usize; 2]> {
             .map(|b| (distance(b), b))
             .collect();
         others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
-        // Near ones look most alike, far ones measure depth best: in steps that grow, because nothing is known of depth.
+        // Near ones match best, far ones measure depth best: in steps that grow, because nothing is known of depth.
         let mut rank = 0.0_f64;
         for _ in 0..NEIGHBOURS {
             let Some(&(_, b)) = others.get(rank as usize) else { break };
@@ -110,7 +111,7 @@ const GROWTH: f64 = 1.25;
 
 /// Share of a camera's image that another one holds too, at the depth where it holds most.
 fn overlap(a: &Camera, b: &Camera) -> f64 {
-    /// Pixels along either side that are asked.
+    /// Search radius in pixels.
     const ASKED: usize = 5;
     let baseline = norm(sub(a.center(), b.center()));
     if dot(a.forward(), b.forward()) < WIDEST.to_radians().cos() {
@@ -129,7 +130,7 @@ fn overlap(a: &Camera, b: &Camera) -> f64 {
     DEPTHS.into_iter().map(held).fold(0.0, f64::max)
 }
 
-/// Two features that look alike.
+/// A match of two features.
 struct Match {
     features: [usize; 2],
     /// Distance of the descriptors, of that to the second best.
@@ -153,7 +154,7 @@ fn matches(views: &[View], [a, b]: [usize; 2], [from, to]: [&[Feature]; 2]) -> V
             }
             let d = feature.distance(other);
             back[j] = back[j].min((d, i));
-            // One place may have two features, of two directions: they are no rivals.
+            // One point may have two features, of two directions: they are not rivals.
             let place = |k: usize| to[k].pixel;
             let same = |k: usize| (place(k)[0] - other.pixel[0]).hypot(place(k)[1] - other.pixel[1]) < OFF;
             if d < first.0 {
@@ -165,7 +166,7 @@ fn matches(views: &[View], [a, b]: [usize; 2], [from, to]: [&[Feature]; 2]) -> V
                 second = (d, j);
             }
         }
-        // What is alone on its line must be as good as if something quite unlike stood next to it.
+        // What is alone on its line must be as good as if something quite unlike was next to it.
         let ratio = (f64::from(first.0) / f64::from(second.0.clamp(1, FAR))).sqrt();
         forth.push((first.0 < FAR && ratio < RATIO).then_some((first.1, ratio)));
     }

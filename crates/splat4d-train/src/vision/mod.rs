@@ -63,11 +63,11 @@ pub(crate) fn points(
     Ok(out)
 }
 
-/// At most `count` points in the wanted pixels of the views: up to half of them tracks, the rest by plane sweep in the
-/// depths of `known` points.
+/// At most `count` points in the requested pixels of the views: up to half of them tracks, the rest by plane sweep in
+/// the depths of `known` points.
 fn on_surfaces(views: &[View], tracks: &[Track], known: &[[f64; 3]], count: usize, time: Option<f64>) -> Vec<Point> {
     let of_track = |t: &Track| {
-        // As its first view sees it.
+        // As in its first view.
         let (view, pixel) = t.seen[0];
         Point { place: t.point, color: views[view].color(pixel), time }
     };

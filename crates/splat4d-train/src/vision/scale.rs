@@ -1,4 +1,4 @@
-//! How large a scene is, and how near it comes, by the points that its cameras see.
+//! Size and nearest distance of a scene, from the points that its cameras see.
 
 use splat4d::scene::Camera;
 
@@ -11,9 +11,9 @@ pub(crate) struct Scale {
     pub depth: f64,
 }
 
-/// Points nearer than this share of all that a camera sees may be wrong ones.
+/// Points nearer than this share of all that a camera sees may be outliers.
 const STRAY: f64 = 1e-3;
-/// Of the distance of the nearest points: surfaces go on a little before them.
+/// Of the distance of the nearest points: surfaces continue a little before them.
 const BEFORE: f64 = 0.5;
 /// Cameras that must see a point.
 const SEEN_BY: usize = 2;
@@ -42,7 +42,7 @@ impl Scale {
     }
 }
 
-/// The number below which this share of them lies.
+/// The quantile of this share.
 fn at_share(values: &mut [f64], share: f64) -> f64 {
     let at = (share * values.len() as f64) as usize;
     *values.select_nth_unstable_by(at, f64::total_cmp).1

@@ -1,9 +1,9 @@
 //! Points on surfaces, by plane sweep: a window of one image is laid at many depths and compared with its neighbours
 //! there (normalised cross-correlation; Collins 1996).
 //!
-//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points are spread evenly in
-//! images and the work follows from how many are wanted. The window is tilted at the best depth (floors and walls are
-//! rarely seen from in front), and neighbours must find the same depth by themselves.
+//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points are spread evenly
+//! in images and the work follows from how many are needed. The window is tilted at the best depth (floors and walls
+//! are rarely seen from in front), and neighbours must find the same depth by themselves.
 
 use super::triangulate::{Transfer, angle_at};
 use super::view::{View, spread};
@@ -25,7 +25,7 @@ const SIDE: usize = 2 * HALF + 1;
 const WINDOW: usize = SIDE * SIDE;
 /// Neighbours that an image is compared with, at most.
 const NEIGHBOURS: usize = 4;
-/// A window whose grey values spread less than this (standard deviation, in [0, 1]) looks the same everywhere.
+/// A window whose grey values spread less than this (standard deviation, in [0, 1]) is uniform.
 const TEXTURE: f32 = 0.012;
 /// Least correlation of a window after tilting, and of one that is tilted.
 const ALIKE: f32 = 0.8;
@@ -38,9 +38,10 @@ const SAME_PEAK: usize = 3;
 const CONFIRMED: usize = 2;
 /// Steps in inverse depth by which two images may differ on a point.
 const AGREE: f64 = 1.5;
-/// Least and largest number of depths; between them, each moves the window by a pixel in the neighbour where it moves most.
+/// Least and largest number of depths; between them, each moves the window by a pixel in the neighbour where it moves
+/// most.
 const DEPTHS: std::ops::RangeInclusive<usize> = 16..=256;
-/// Windows that are tried a point that is wanted: about so few are found.
+/// Windows tried per requested point: about this few succeed.
 const TRIES: f64 = 3.0;
 /// Cells of the lattice are not smaller than this, pixels.
 const CELL: f64 = 3.0;
@@ -49,11 +50,11 @@ const TILT: f64 = 1.0;
 const HALVINGS: usize = 4;
 /// Rounds of moves before they are halved.
 const ROUNDS: usize = 2;
-/// Points that a camera must see before they say in which depths to look.
+/// Points that a camera must see before they determine the range of depths.
 const ENOUGH: usize = 12;
-/// Of the points that a camera sees, those that may be wrong at either end.
+/// Of the points that a camera sees, the share of outliers at either end.
 const STRAY: f64 = 0.02;
-/// Surfaces may come nearer than what points were found on, times.
+/// Surfaces may be nearer than the points, by this factor.
 const BEYOND: f64 = 1.6;
 /// Without points: nearest depth, of the distance to the nearest neighbour.
 const UNKNOWN: f64 = 1.0;
@@ -88,14 +89,14 @@ struct Window {
     y: usize,
 }
 
-/// A place in depth: inverse depth, and by how much of itself it changes from pixel to pixel.
+/// A position in depth: inverse depth, and by how much of itself it changes from pixel to pixel.
 #[derive(Clone, Copy)]
 struct Patch {
     inverse: f64,
     tilt: [f64; 2],
 }
 
-/// At most `count` points, in the order of views. `known`: points that say in which depths to look, and which views are
+/// At most `count` points, in the order of views. `known`: points that determine the depths, and which views are
 /// neighbours.
 pub(crate) fn sweep(views: &[View], known: &[[f64; 3]], count: usize) -> Vec<Swept> {
     let references: Vec<Option<Reference<'_>>> =
@@ -197,7 +198,7 @@ impl<'a> Reference<'a> {
             let importance = |b: usize| {
                 let other = views[b].camera.center();
                 let one = |(x, _): &([f64; 3], f64)| match sees(&views[b], *x) {
-                    Some(_) => angle_worth(angle_at(*x, center, other).to_degrees()),
+                    Some(_) => angle_weight(angle_at(*x, center, other).to_degrees()),
                     None => 0.0,
                 };
                 seen.iter().map(one).sum::<f64>()
@@ -237,7 +238,7 @@ impl<'a> Reference<'a> {
         self.step * k as f64
     }
 
-    /// Where a window is in depth; `None` where neighbours do not agree on it, or as well elsewhere.
+    /// Depth of a window; `None` where neighbours do not agree on it, or as well elsewhere.
     fn find(&self, window: &Window) -> Option<Patch> {
         let flat = |inverse: f64| Patch { inverse, tilt: [0.0; 2] };
         let scores: Vec<f32> = (0..self.depths).map(|k| self.alike(window, flat(self.inverse(k)))).collect();
@@ -291,7 +292,7 @@ impl<'a> Reference<'a> {
         (best.1 >= ALIKE).then_some(best.0)
     }
 
-    /// Whether this view finds, by itself, the point that `other` has at a pixel and an inverse depth.
+    /// Whether this view alone finds the point that `other` has at a pixel and an inverse depth.
     fn confirms(&self, other: &Reference<'_>, pixel: [f64; 2], inverse: f64) -> bool {
         let point = other.view.camera.unproject(pixel, 1.0 / inverse);
         let Some((here, z)) = self.view.camera.project(point).filter(|(p, _)| self.view.holds(*p)) else {
@@ -374,7 +375,7 @@ fn correlation(window: &Window, other: &Other<'_>, patch: Patch) -> Option<f32> 
 }
 
 /// The weight of a neighbour at this angle for measuring depth.
-fn angle_worth(degrees: f64) -> f64 {
+fn angle_weight(degrees: f64) -> f64 {
     if !ANGLES.contains(&degrees) {
         return 0.0;
     }
@@ -384,7 +385,7 @@ fn angle_worth(degrees: f64) -> f64 {
 
 /// Pixels that the middle of an image moves over in a neighbour between infinity and an inverse depth.
 fn path(view: &View, transfer: &Transfer, to: f64) -> f64 {
-    /// Pieces of the way: it is nearly straight, and not evenly fast.
+    /// Segments of the path: it is nearly straight, at a varying speed.
     const PIECES: usize = 8;
     let middle = [0.5 * view.camera.width as f64, 0.5 * view.camera.height as f64];
     let places: Vec<[f64; 2]> =

@@ -1,6 +1,5 @@
-//! Synthetic rooms in which every point's place is known: a slanted wall and a floor with a noise texture, and a
-//! panel that
-//! moves before them.
+//! Synthetic rooms in which every point's position is known: a slanted wall and a floor with a noise texture, and a
+//! panel that moves before them.
 
 use super::*;
 use crate::capture::frames::Picture;
@@ -58,7 +57,7 @@ impl Room {
         0.1 * moment as f64
     }
 
-    /// Smooth noise in [0, 1] of a place on a surface.
+    /// Smooth noise in [0, 1] of a position on a surface.
     fn noise(&self, surface: u64, [u, v]: [f64; 2]) -> f64 {
         let rng = Rng::new(7, "texture", surface);
         let mut sum = 0.0;

@@ -37,7 +37,7 @@ impl Transfer {
         Self { turn: mat_mul(&mat_mul(&k, &rotation), &inverse), shift: mat_vec(&k, shift) }
     }
 
-    /// Where the pixel lies in the other image at an inverse depth; nothing behind that camera.
+    /// Position of the pixel in the other image at an inverse depth; none behind that camera.
     pub(crate) fn at(&self, pixel: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let q = mat_vec(&self.turn, [pixel[0], pixel[1], 1.0]);
         let q: [f64; 3] = std::array::from_fn(|k| q[k] + inverse * self.shift[k]);
@@ -58,7 +58,7 @@ impl Transfer {
 pub struct PixelObservation<'a> {
     /// By which camera (pinhole).
     pub camera: &'a Camera,
-    /// Where in its image.
+    /// Position in its image.
     pub pixel: [f64; 2],
 }
 
@@ -70,7 +70,7 @@ impl PixelObservation<'_> {
     }
 }
 
-/// The angle at a point between the directions to two places, radians.
+/// The angle at a point between the directions to two positions, radians.
 pub fn angle_at(x: [f64; 3], a: [f64; 3], b: [f64; 3]) -> f64 {
     dot(normalize(sub(a, x)), normalize(sub(b, x))).clamp(-1.0, 1.0).acos()
 }
@@ -78,8 +78,8 @@ pub fn angle_at(x: [f64; 3], a: [f64; 3], b: [f64; 3]) -> f64 {
 /// Gauss-Newton steps after the linear guess: reprojection errors then change no more.
 const STEPS: usize = 3;
 
-/// The point that several cameras see: where their rays come nearest to each other, then least squares of the
-/// reprojection errors. Nothing where the rays are parallel or meet behind a camera.
+/// The point that several cameras see: the point nearest to their rays, then least squares of the reprojection errors.
+/// Nothing where the rays are parallel or meet behind a camera.
 pub fn triangulate(sights: &[PixelObservation<'_>]) -> Option<[f64; 3]> {
     let mut a = [[0.0; 3]; 3];
     let mut b = [0.0; 3];
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn points_come_back_from_their_pixels_in_any_unit() {
+    fn points_are_triangulated_in_any_unit() {
         for unit in [1e-3, 1.0, 1e3] {
             let cameras = [-1.0, 0.2, 1.0].map(|x| camera(x, unit));
             let x = [0.3, -0.2, 0.5].map(|v| v * unit);

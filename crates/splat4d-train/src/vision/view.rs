@@ -1,5 +1,5 @@
-//! The images that points are searched for in: the static background as fixed cameras see it, single times, or the frames
-//! of moving cameras.
+//! The images that points are searched for in: the static background as fixed cameras see it, single times, or the
+//! frames of moving cameras.
 
 use super::raster::{blurred, grey};
 use crate::Result;
@@ -16,17 +16,17 @@ const VIEWS: usize = 64;
 const PIXELS: usize = 300_000;
 /// Times of a fixed camera whose median is the static background.
 const MEDIAN_OF: usize = 9;
-/// From so many times on a median knows the static background.
+/// From this many times on a median gives the static background.
 const MEDIAN_FROM: usize = 3;
 /// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
 /// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
-/// Differences are blurred by so many pixels: single ones are noise.
+/// Differences are blurred by this many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 
 /// An image to search for points in.
 pub(crate) struct View {
-    /// Where it was taken from; its size is the image's.
+    /// Its camera; its size is the image's.
     pub camera: Camera,
     /// Colours as bytes, pixel by pixel.
     pub colors: Vec<[u8; 3]>,
@@ -65,7 +65,7 @@ impl View {
 pub(crate) enum Rigs {
     /// Cameras that do not move, each with its frames in the order of time.
     Fixed(Vec<Vec<usize>>),
-    /// Frames of cameras that move: what they agree on is static.
+    /// Frames of cameras that move: their common part is static.
     Moving(Vec<usize>),
 }
 
@@ -95,12 +95,12 @@ impl Rigs {
         Self::Fixed(fixed)
     }
 
-    /// Whether a fixed camera has so many times that their median is the static background.
+    /// Whether a fixed camera has this many times that their median is the static background.
     pub(crate) fn have_medians(&self) -> bool {
         matches!(self, Self::Fixed(rigs) if rigs.iter().any(|rig| rig.len() >= MEDIAN_FROM))
     }
 
-    /// The static background, as every camera sees it.
+    /// The static background, per camera.
     pub(crate) fn still(&self, frames: &dyn Frames) -> Result<Vec<View>> {
         match self {
             Self::Moving(all) => all.par_iter().map(|&i| single(frames, i)).collect(),
@@ -108,7 +108,7 @@ impl Rigs {
         }
     }
 
-    /// What differs from `still` in the frames nearest to time t, and their time; nothing where cameras move or times
+    /// Differences from `still` in the frames nearest to time t, and their time; nothing where cameras move or times
     /// are few.
     pub(crate) fn moving(&self, frames: &dyn Frames, still: &[View], t: f64) -> Result<Option<(Vec<View>, f64)>> {
         let Self::Fixed(rigs) = self else { return Ok(None) };

@@ -16,7 +16,8 @@ const FPS: f64 = 30.0;
 const GAUSSIANS: usize = 150;
 const FRAMES: f64 = 40.0;
 
-/// In every frame every Gaussian is somewhere else, and each look at one takes `cost` microseconds of a clock of its own.
+/// In every frame every Gaussian is somewhere else, and each look at one takes `cost` microseconds of a clock of its
+/// own.
 #[derive(Clone, Default)]
 struct Leaps {
     clock: Arc<AtomicU64>,
@@ -104,7 +105,7 @@ fn a_file_keeps_its_size_limit_and_reports_the_size_it_would_need() {
     );
 }
 
-/// All looks at the model would take three times the minutes there are.
+/// All samples of the model would take three times the minutes there are.
 #[test]
 fn a_slow_model_is_baked_in_time() {
     let seconds = 30.0;

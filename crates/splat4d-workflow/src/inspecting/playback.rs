@@ -1,4 +1,4 @@
-//! What the index of a playback file states: sections, sizes, and how much has to arrive before there is something to see.
+//! Content of a playback file's index: sections, sizes, and how much has to arrive before there is something to see.
 
 use super::line;
 use crate::files::{grouped, human_bytes};
@@ -96,7 +96,7 @@ pub struct Conformance {
 
 /// Checks a playback file against the whole specification of its format.
 ///
-/// Errors: it cannot be read, it is no playback file, readers refuse it.
+/// Errors: it cannot be read, it is not a playback file, readers refuse it.
 pub fn conformance(path: &Path) -> Result<Conformance> {
     let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
     if !bytes.starts_with(&MAGIC) {
@@ -133,7 +133,7 @@ fn section(e: &Entry) -> Value {
     v
 }
 
-/// Bytes from the file's start to the end of the first tier of the clip's start, and of the palettes on the way.
+/// Bytes from the file's start to the end of the first tier of the clip's start, and of the palettes before it.
 fn first_picture(index: &Index) -> u64 {
     let start = index.pages_at(index.meta.clip[0]);
     let first = start.iter().filter(|(_, e)| e.tier == 0).map(|(_, e)| e.offset + u64::from(e.stored)).max();

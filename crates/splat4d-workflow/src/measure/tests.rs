@@ -59,7 +59,7 @@ fn a_scene_and_the_file_of_it_are_measured_alike() {
         assert!((side.active_mean / alive - 1.0).abs() < 0.05 && side.active_max == 200, "half live: {side:?}");
         assert!(side.fps > 0.0 && side.raster_fps > side.fps && side.decode_ms > 0.0 && side.pairs > 100.0, "{side:?}");
     }
-    // Both draw the same image, so the blend loop has about the same to do.
+    // Both render the same image, so the blend loop has about the same work.
     assert!((scene_side.pairs / file.pairs - 1.0).abs() < 0.1, "{sides:?}");
     let text = serde_json::to_string(&sides).unwrap();
     assert_eq!(serde_json::from_str::<Vec<Side>>(&text).unwrap().len(), 2);
@@ -71,9 +71,9 @@ fn sampled_views_cover_the_rig_and_the_clip() {
     for cameras in [1, 2, 3, 20, 23, 100] {
         let all = measured_views(&views(cameras), [1.0, 3.0], [80, 40]);
         assert!(all.windows(2).all(|w| w[0].time.0 < w[1].time.0));
-        assert!(all[0].time.0 > 1.0 && all[LOOKS - 1].time.0 < 3.0);
+        assert!(all[0].time.0 > 1.0 && all[VIEWS - 1].time.0 < 3.0);
         let places: BTreeSet<[u64; 3]> = all.iter().map(|l| l.camera.center().map(f64::to_bits)).collect();
-        assert_eq!(places.len(), cameras.min(LOOKS), "all cameras take part");
+        assert_eq!(places.len(), cameras.min(VIEWS), "all cameras take part");
         // 48 rows at 0.6 rad became 40 at 0.6 rad.
         let fov = 2.0 * (20.0 / all[0].camera.intrinsics.fy).atan();
         assert!((fov - 0.6).abs() < 1e-12 && (all[0].camera.width, all[0].camera.height) == (80, 40));

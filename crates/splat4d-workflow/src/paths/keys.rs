@@ -209,7 +209,7 @@ mod tests {
         {"time": 4, "position": [0, 1, -4], "look_at": [0, 1, 0], "fov_y": 60, "scene_time": 1.5}]}"#;
 
     #[test]
-    fn keys_are_met_and_the_way_between_is_smooth() {
+    fn the_path_passes_its_keys_smoothly() {
         let track = Track::parse(PATH, UP).unwrap();
         let template = Camera::with_fov_y(Se3::IDENTITY, 0.8, 64, 48);
         assert_eq!((track.fps, track.seconds()), (Some(24.0), 3.0));
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn one_key_is_a_standing_camera() {
+    fn one_key_is_a_static_camera() {
         let track = Track::parse(r#"{"keys": [{"time": 0, "position": [0,0,3], "look_at": [0,0,0]}]}"#, UP).unwrap();
         let template = Camera::with_fov_y(Se3::IDENTITY, 0.8, 64, 48);
         let (camera, time) = track.at(5.0, &template);

@@ -46,7 +46,7 @@ pub enum Route {
     Test,
     /// The training views, one frame each.
     Train,
-    /// One camera of the data set is static while time goes on.
+    /// One camera of the data set is static while time continues.
     Camera(String),
     /// Key frames from a JSON file.
     Keys(PathBuf),
@@ -86,7 +86,7 @@ pub struct Clock {
 
 /// Shortest film of an orbit, seconds: faster turns are hard to follow.
 const ORBIT_SECONDS: f64 = 6.0;
-/// Longest film of an orbit unless slow motion is asked for, seconds.
+/// Longest film of an orbit unless slow motion is requested, seconds.
 const ORBIT_SECONDS_MAX: f64 = 20.0;
 /// Seconds of an orbit's film of a clip that plays for so long.
 pub fn orbit_seconds(playing: f64) -> f64 {
@@ -97,12 +97,12 @@ pub fn orbit_seconds(playing: f64) -> f64 {
 const MAX_FRAMES: f64 = 200_000.0;
 
 impl Clock {
-    /// Seconds of film when the scene plays by itself.
+    /// Seconds of film when the scene plays alone.
     fn playing(&self) -> f64 {
         self.seconds.unwrap_or((self.to - self.from) * self.slow_motion.unwrap_or(1.0))
     }
 
-    /// The scene's second, `share` (0 to 1) of the way through the film.
+    /// The scene's second, `share` (0 to 1) of the film.
     fn at(&self, share: f64) -> f64 {
         self.freeze.unwrap_or(self.from + (self.to - self.from) * share)
     }
@@ -147,7 +147,7 @@ pub fn shots(
         }
         Route::Test | Route::Train => {
             let held = *route == Route::Test;
-            // Views outside the asked range are left out; a frozen time shows each camera once.
+            // Views outside the requested range are left out; a frozen time shows each camera once.
             let mut seen: Vec<&str> = Vec::new();
             let mut out = Vec::new();
             for view in views.iter().filter(|v| v.held == held) {
@@ -195,7 +195,7 @@ pub fn shots(
     }
 }
 
-/// Frames a second that a key frame file asks for.
+/// Frames a second that a key frame file requests.
 pub fn fps_of(file: &Path) -> Result<Option<f64>> {
     Ok(keys::Track::read(file, [0.0, 1.0, 0.0])?.fps)
 }

@@ -18,7 +18,7 @@ const FACING: f64 = 0.8;
 const LONG_SIDE: usize = 960;
 /// Vertical field of view where there is no camera to copy: 45°.
 const FOV_Y: f64 = PI / 4.0;
-/// Half-widths of the sway when the training cameras stand in one spot: 6°.
+/// Half-widths of the sway when the training cameras are in one spot: 6°.
 const SMALL_SWAY: f64 = 0.1;
 
 /// Middle, distance, height and arc of an orbit.
@@ -74,7 +74,7 @@ impl Stage {
         self.reach >= PI
     }
 
-    /// The camera `share` (0 to 1) of the way; it ends where it began.
+    /// The camera at `share` (0 to 1) of the orbit; it ends where it began.
     pub fn orbit(&self, share: f64) -> Camera {
         let turn = if self.full() { TAU * share } else { self.reach * (TAU * share).sin() };
         let angle = self.azimuth + turn;

@@ -63,7 +63,7 @@ pub(super) fn run(
     Ok(model_scores)
 }
 
-/// The images that training cameras take of one frame of the future, at the time that the filter asks at.
+/// The images that training cameras take of one frame of the future, at the time that the filter requests.
 struct NewFrame {
     pictures: Dataset,
     time: f64,

@@ -1,4 +1,4 @@
-//! Forecasts next to the images of what really came.
+//! Forecasts compared with the later images.
 
 use super::{Forecast, Work};
 use crate::deadline::unless_stopped;
@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 const CHANGED: f32 = 0.05;
 /// Nodes that carry a true point.
 const CARRIERS: usize = 4;
-/// dB at which equal images stand: 8 bits resolve no more.
+/// dB reported for equal images: 8 bits resolve no more.
 const MOST_DB: f64 = 99.0;
 
 /// An image of the future, and the last observed one of the same camera.
@@ -116,7 +116,7 @@ impl Views {
         self.views.iter().map(|v| v.horizon).collect::<BTreeSet<_>>().len()
     }
 
-    /// Draws a scene from where images were taken, and compares.
+    /// Renders a scene from where images were taken, and compares.
     pub(super) fn cases(&self, work: &Work, scene: &Scene<f32>, stop: &AtomicBool) -> Result<Vec<Case>> {
         let mut painter = Painter::new(scene, scene.background, work.antialias, false);
         let mut out = Vec::new();
@@ -157,7 +157,7 @@ impl Views {
         Some(moments.iter().enumerate().map_while(error).collect())
     }
 
-    /// Films of truth (left) and prediction (right), one a camera of the first two.
+    /// Films of truth (left) and prediction (right), one per camera of the first two.
     pub(super) fn films(
         &self,
         work: &Work,

@@ -32,9 +32,9 @@ pub(super) fn all(
     Ok(())
 }
 
-/// Paths of the nodes as observed and as each model goes on, and the weights of what was trained:
-/// `observed.positions` \[ticks, nodes, 3], `observed.rotations` \[ticks, nodes, 4] wxyz, `MODEL.positions`, `MODEL.rotations`,
-/// `MODEL.SEED.WEIGHT`.
+/// Paths of the nodes as observed and as each model continues, and the weights of what was trained:
+/// `observed.positions` \[ticks, nodes, 3], `observed.rotations` \[ticks, nodes, 4] wxyz, `MODEL.positions`,
+/// `MODEL.rotations`, `MODEL.SEED.WEIGHT`.
 fn dynamics(work: &Work, forecasts: &[Forecast]) -> Result<Vec<u8>> {
     let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> = Vec::new();
     let mut moments = |name: &str, moments: &[Moment]| {

@@ -1,5 +1,5 @@
-//! Curves and bars as inline SVG: no script, no library; colours come from the page's style sheet, so that they follow
-//! light and dark. Every point carries its numbers as a tooltip.
+//! Curves and bars as inline SVG: no script, no library; colours are those of the page's style sheet, so that they
+//! follow light and dark. Every point carries its numbers as a tooltip.
 
 use std::fmt::Write;
 
@@ -26,7 +26,7 @@ pub struct Series {
     pub points: Points,
 }
 
-/// What a curve's stroke has in addition to its colour: from the seventh on, colours come again with dashes.
+/// Dashes of a curve: from the seventh on, colours repeat with dashes.
 fn dashes(i: usize) -> &'static str {
     if i < COLORS { "" } else { ";stroke-dasharray:6 4" }
 }
@@ -140,13 +140,13 @@ pub fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     Some(svg)
 }
 
-/// The colours of the page's style sheet, for images that stand alone.
+/// The colours of the page's style sheet, for images outside the page.
 const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c4:#0f8a80;--c5:#5c6b73;--soft:#6d6a66;\
 --line:#e6e2dc;font-family:sans-serif}@media(prefers-color-scheme:dark){svg{--c0:#f08c4e;--c1:#6fb1f2;--c2:#7cc68d;\
 --c3:#c69be4;--c4:#5fd0c5;--c5:#9fb0ba;--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}\
 .tick,.axis{fill:var(--soft);font-size:11.5px}.line{fill:none;stroke-width:1.8}";
 
-/// Room for a name below the curves of a file; three fit.
+/// Space for a name below the curves of a file; three fit.
 const NAME: f64 = 118.0;
 
 /// The same curves as a file of their own, with a mark at every point and the names below.
@@ -239,7 +239,8 @@ fn ticks(lo: f64, hi: f64, count: usize) -> Vec<f64> {
     (first..).map(|i| i as f64 * step).take_while(|v| *v <= hi + 1e-9 * step).take(2 * count + 2).collect()
 }
 
-/// Labels of ticks, with as many decimals as their distance needs; thousands and millions are shortened if they stay distinct.
+/// Labels of ticks, with as many decimals as their distance needs; thousands and millions are shortened if they stay
+/// distinct.
 fn labels(ticks: &[f64]) -> Vec<String> {
     let shortened: Vec<String> = ticks.iter().copied().map(short).collect();
     let step = ticks.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
@@ -292,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn charts_survive_what_runs_may_hold() {
+    fn charts_accept_empty_and_invalid_series() {
         let series = |points: Vec<(f64, f64)>| [Series { name: "a<b".into(), points }];
         assert!(lines(&series(vec![]), "step", "dB").is_none());
         assert!(lines(&series(vec![(1.0, f64::NAN)]), "step", "dB").is_none());

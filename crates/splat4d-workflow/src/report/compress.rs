@@ -1,5 +1,5 @@
-//! What compression did, as part of a run's page: before and after side by side, where the bytes are, the images of
-//! both, and how it was done. All of it comes from `compress.json`, the file itself and the two runs' images.
+//! Compression results, as part of a run's page: before and after side by side, where the bytes are, the images of
+//! both, and how it was done. All of it is read from `compress.json`, the file itself and the two runs' images.
 
 use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};

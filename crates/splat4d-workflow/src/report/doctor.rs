@@ -13,7 +13,7 @@ use splat4d_train::event::{Event, Progress};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// Looks at a capture and writes `doctor.html`, whose path is given back, and `doctor.json` into `folder`.
+/// Examines a capture and writes `doctor.html`, whose path is returned, and `doctor.json` into `folder`.
 pub fn made(capture: &Capture, folder: &Path, console: &dyn Listener) -> Result<(Report, PathBuf)> {
     let mut listen = |event: &Event| console.event(event);
     let report = examine(capture, &Options::default(), &mut Progress(&mut listen))?;
@@ -139,7 +139,7 @@ fn page(report: &Report, capture: &Capture) -> String {
     )
 }
 
-/// What pairs of cameras say, folded.
+/// Findings of pairs of cameras, folded.
 fn pairs(report: &Report) -> String {
     if report.pairs.is_empty() {
         return String::new();

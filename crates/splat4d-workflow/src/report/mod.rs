@@ -348,12 +348,12 @@ fn lives(out: &mut String, run: &Run) {
     }
 }
 
-/// What the figures hold for, and what else was measured: other views, another background.
+/// Conditions of the figures, and further measurements: other views, another background.
 fn conditions(out: &mut String, run: &Run) {
     let own = run.results.as_ref().map(|scores| Baseline { name: "", step: run.iteration().unwrap_or(0), scores });
     let mut rows = String::new();
     for entry in own.into_iter().chain(baselines(&run.all_results)) {
-        // Runs of older versions do not say.
+        // Runs of older versions do not contain it.
         let Some(told) = entry.scores.get("conditions") else { continue };
         let text = |key: &str| told.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
         let score = |key: &str, digits: usize| {

@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 use splat4d_train::eval::metrics::error_map;
 use std::path::{Path, PathBuf};
 
-/// Width of an image in the page, pixels: three stand side by side on a wide screen.
+/// Width of an image in the page, pixels: three fit side by side on a wide screen.
 const WIDTH: u32 = 420;
 /// JPEG quality: no artefact that could be taken for one of the scene's.
 const QUALITY: u8 = 90;

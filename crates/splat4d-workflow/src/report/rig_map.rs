@@ -9,7 +9,7 @@ use std::fmt::Write;
 /// Width of the map and its margin, units of the SVG.
 const WIDTH: f64 = 560.0;
 const MARGIN: f64 = 64.0;
-/// Most points that are drawn.
+/// Most points that are plotted.
 const POINTS: usize = 600;
 /// Length of a viewing direction, of the map's width.
 const ARROW: f64 = 0.09;
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_stand_on_the_map_as_seen_from_above() {
+    fn the_map_shows_cameras_from_above() {
         let plan = Plan::new([0.0, 1.0, 0.0]);
         let [a, b] = [plan.of([2.0, 5.0, 0.0]), plan.of([0.0, -3.0, 1.0])];
         assert!(
@@ -196,7 +196,7 @@ mod tests {
         let svg = draw(&cameras, &[[1.0, 1.0]], &bounds, &|name| (name == "right").then_some(Grade::Bad));
         assert!(svg.contains("left&lt;1&gt;") && !svg.contains("left<1>"));
         assert_eq!(svg.matches("#d4351c").count(), 2, "line and dot of the bad one");
-        // The first stands at the left and looks to the right; y goes downwards in SVG.
+        // The first is at the left and looks to the right; y goes downwards in SVG.
         assert!(svg.contains(&format!("x1=\"{MARGIN:.1}\"")), "{svg}");
     }
 }

@@ -81,7 +81,7 @@ fn the_report_is_complete_and_self_contained() {
     for outside in ["http://", "https://", "<script", "NaN", "<odd>"] {
         assert!(!html.contains(outside), "{outside} must not be there");
     }
-    // For a look with a browser: KEEP_REPORT=/somewhere cargo test the_page
+    // To view it in a browser: KEEP_REPORT=/somewhere cargo test the_page
     if let Some(keep) = std::env::var_os("KEEP_REPORT") {
         std::fs::write(keep, html).unwrap();
     }

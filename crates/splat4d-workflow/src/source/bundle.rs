@@ -42,7 +42,7 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     let Some((file, iteration)) = newest(folder) else { return Ok(None) };
     let mut source = Source::open_at(&file, fps)?;
     if iteration.is_some() {
-        source.warnings.say(format!("the newest iteration is read: {}", file.display()));
+        source.warnings.add(format!("the newest iteration is read: {}", file.display()));
     }
     Ok(Some(source))
 }
@@ -140,7 +140,7 @@ fn streamed(folder: &Path) -> Result<Source> {
     }
     let params = levels::join(&pieces).map_err(place)?;
     if finest.levels > 1 {
-        warnings.say(format!("the finest of {} levels of detail is read", finest.levels));
+        warnings.add(format!("the finest of {} levels of detail is read", finest.levels));
     }
     let scene = Scene { up: sog::DIALECT.up, ..dialect::still(params) };
     Ok(Source { dialect: Some(sog::DIALECT), warnings, ..Source::own(scene) })

@@ -1,4 +1,4 @@
-//! [`Bakery`]: a scene that is sampled once and cut into segments as often as is wanted.
+//! [`Bakery`]: a scene that is sampled once and cut into segments as often as is needed.
 
 use super::fit::{Fitter, Piece, Subject, seen};
 use super::life::Lives;
@@ -6,7 +6,7 @@ use super::rank::rank;
 use super::rate::{PRICES, Rate, Sums, price};
 use super::repeat::Rounds;
 use super::sample::{self, Framed, Row, Samples};
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::straight::{Line, learnt};
 use super::tally::{Tally, bounded, cut, in_order, page, quantiles, sh_degree};
 use super::tree::{Span, Tree};
@@ -21,23 +21,23 @@ use std::borrow::Cow;
 
 /// Rows of a straight layer between two calls of the progress listener.
 const STRAIGHT_RUN: usize = 1 << 16;
-/// Samples of a scene are kept up to so many numbers (512 MiB), and taken again for every cut beyond.
+/// Samples of a scene are kept up to this many numbers (512 MiB), and sampled again for every cut beyond that.
 const KEPT: usize = 128 << 20;
 /// Rows of a task that measures.
 const ROWS: usize = 128;
-/// The time between samples is not halved beyond so many of them: 30,000 Gaussians at 266 times.
+/// The time between samples is not halved beyond this many of them: 30,000 Gaussians at 266 times.
 const REFINED: usize = 8_000_000;
 /// Gaussians of a layer whose motion between time samples is examined.
 const PROBED: usize = 400;
 /// Mean squared error of images by motion between time samples that is let pass: 46 dB, a quarter of what 40 dB allow.
 const BETWEEN: f64 = 2.5e-5;
 
-/// Where motion that is not straight is split.
+/// Criterion for splits of nonlinear motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Cut {
-    /// Where a segment misses by more than so many pixels.
+    /// If a segment misses by more than this many pixels.
     Tolerance(f64),
-    /// Where it lowers the mean squared error of images by more than this price of a segment ([`Curve`]).
+    /// If it lowers the mean squared error of images by more than this price of a segment ([`Curve`]).
     Price(f64),
 }
 
@@ -56,7 +56,8 @@ impl Curve {
         self.straight as f64 + self.rate.pieces[PRICES - 1]
     }
 
-    /// Primitives and mean squared error of images (of channels from 0 to 1, the Gaussians' errors taken as independent).
+    /// Primitives and mean squared error of images (of channels from 0 to 1, the Gaussians' errors taken as
+    /// independent).
     pub fn at(&self, of: f64) -> [f64; 2] {
         let place = (of / price(0)).ln() / (price(1) / price(0)).ln();
         let place = place.clamp(0.0, (PRICES - 1) as f64);
@@ -68,7 +69,7 @@ impl Curve {
         [self.straight as f64 + between(&self.rate.pieces), between(&self.rate.error)]
     }
 
-    /// The lowest price with at most so many primitives; the highest there is, where there are more at any.
+    /// The lowest price with at most this many primitives; the highest there is, where there are more at any.
     pub fn price_of(&self, primitives: f64) -> f64 {
         self.first(|[pieces, _]| pieces <= primitives).unwrap_or(price(PRICES - 1))
     }
@@ -99,12 +100,12 @@ impl Curve {
     }
 }
 
-/// A scene on its way into segments.
+/// A scene that is being cut into segments.
 pub struct Bakery<'a> {
     scene: &'a Scene<f32>,
     options: &'a Options,
     tree: Tree,
-    sampling: Lookout,
+    sampling: Viewpoints,
     weights: Option<Weights>,
     /// By layer and run, where they are kept.
     kept: Vec<Vec<Samples>>,
@@ -129,8 +130,8 @@ impl<'a> Curved<'a> {
         Self { layer, lives: Lives::new(layer), frame: Framed::of(layer), rows, colors }
     }
 
-    fn look(&self, rows: &[(usize, [f64; 2])], tree: &Tree) -> Samples {
-        sample::look(self.layer, &self.frame, rows, tree, self.colors)
+    fn sample(&self, rows: &[(usize, [f64; 2])], tree: &Tree) -> Samples {
+        sample::sample_rows(self.layer, &self.frame, rows, tree, self.colors)
     }
 
     /// Calls `each` with one run of samples after the other: those that were kept, or new ones.
@@ -142,14 +143,14 @@ impl<'a> Curved<'a> {
         while !rest.is_empty() {
             let (run, later) = rest.split_at(sample::run_length(rest, tree, self.colors));
             rest = later;
-            each(Cow::Owned(self.look(run, tree)))?;
+            each(Cow::Owned(self.sample(run, tree)))?;
         }
         Ok(())
     }
 }
 
 impl<'a> Bakery<'a> {
-    /// A scene that was not sampled yet. Errors: a scene with a pixel head; options out of range; a clip that is no clip.
+    /// A scene before sampling. Errors: a scene with a pixel head; options out of range; an invalid clip.
     pub fn new(scene: &'a Scene<f32>, options: &'a Options) -> Result<Self> {
         scene.without_head("a playback file")?;
         // An endless tolerance is allowed: nothing is split then.
@@ -161,12 +162,12 @@ impl<'a> Bakery<'a> {
         if !(1..=MAX_REPEAT).contains(&options.repeat) {
             return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
         }
-        let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment, usize::MAX)?;
+        let tree = Tree::new(scene.clip, scene.fps, options.sample_rate, options.segment, usize::MAX)?;
         let cameras: Vec<_> =
             options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
-        let sampling = Lookout::new(&cameras, &means(scene));
+        let sampling = Viewpoints::new(&cameras, &means(scene));
         let mut bakery = Self { scene, options, tree, sampling, weights: None, kept: Vec::new() };
-        bakery.tree = bakery.tree_of(options.looks)?;
+        bakery.tree = bakery.tree_of(options.sample_rate)?;
         Ok(bakery)
     }
 
@@ -176,7 +177,7 @@ impl<'a> Bakery<'a> {
     }
 
     /// Samples the model and measures the curve of segments and errors. None: all motion is straight, and there is
-    /// nothing to choose. `progress` hears of all that is done.
+    /// nothing to choose. `progress` is called with all finished work.
     pub fn measure(&mut self, progress: &mut dyn FnMut(usize, usize)) -> Result<Option<Curve>> {
         let layers = self.layers();
         let count = |l: &Cow<'_, Layer<f32>>| if self.is_split(l) { l.params.len() } else { 0 };
@@ -191,8 +192,8 @@ impl<'a> Bakery<'a> {
         self.refine(&layers)?;
         let numbers = |l: &Cow<'_, Layer<f32>>| {
             let curved = Curved::new(l, &self.tree);
-            let looks = |(_, seen): &(usize, [f64; 2])| self.tree.around(*seen).map(|k| k as f64);
-            let all: f64 = curved.rows.iter().map(looks).map(|[first, last]| last - first + 1.0).sum();
+            let frames = |(_, seen): &(usize, [f64; 2])| self.tree.around(*seen).map(|k| k as f64);
+            let all: f64 = curved.rows.iter().map(frames).map(|[first, last]| last - first + 1.0).sum();
             all * (sample::GEOMETRY + curved.colors) as f64
         };
         let keeps = layers.iter().filter(|l| self.is_split(l)).map(numbers).sum::<f64>() <= KEPT as f64;
@@ -224,8 +225,8 @@ impl<'a> Bakery<'a> {
         Ok(Some(curve))
     }
 
-    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` hears how many Gaussians
-    /// of how many are done.
+    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` is called with the
+    /// finished number of Gaussians and their total.
     ///
     /// Errors: a model that would become too many primitives. Panics: a price before anything was measured.
     pub fn bake(&self, by: Cut, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
@@ -297,7 +298,7 @@ impl<'a> Bakery<'a> {
         self.scene.layers.iter().map(Layer::with_frame_absorbed).collect()
     }
 
-    /// Whether the layer's pages stay as they are.
+    /// Whether the layer's pages are kept unchanged.
     fn is_kept(&self, layer: &Layer<f32>) -> bool {
         self.options.repeat == 1 && is_page(layer)
     }
@@ -307,19 +308,20 @@ impl<'a> Bakery<'a> {
         !self.is_kept(layer) && Line::of(layer).is_none()
     }
 
-    /// The tree with so many samples a second, as far as their number is allowed.
-    fn tree_of(&self, looks: f64) -> Result<Tree> {
+    /// The tree with this many samples a second, as far as their number is allowed.
+    fn tree_of(&self, rate: f64) -> Result<Tree> {
         let rows: usize = self.scene.layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
         let most = self.options.samples.checked_div(rows).unwrap_or(usize::MAX);
         let Scene { clip, fps, .. } = *self.scene;
-        Tree::new(clip, fps, looks, self.options.segment, most)
+        Tree::new(clip, fps, rate, self.options.segment, most)
     }
 
     /// Halves the time between samples while the motion between them would show.
     fn refine(&mut self, layers: &[Cow<'_, Layer<f32>>]) -> Result<()> {
         loop {
             let finer = self.tree_of(2.0 * self.tree.rate())?;
-            // Every second sample of the finer tree is one of this tree's: a segment over two of its steps misses the middle.
+            // Every second sample of the finer tree is one of this tree's: a segment over two of its steps misses the
+            // middle.
             let gaussians: usize = layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
             if finer.frames() < 2 * self.tree.frames() - 1 || gaussians * finer.frames() > REFINED {
                 return Ok(());
@@ -329,7 +331,7 @@ impl<'a> Bakery<'a> {
                 let curved = Curved::new(layer, &finer);
                 let stride = curved.rows.len().div_ceil(PROBED).max(1);
                 let rows: Vec<_> = curved.rows.iter().copied().step_by(stride).collect();
-                let samples = curved.look(&rows, &finer);
+                let samples = curved.sample(&rows, &finer);
                 let of = |row: &Row| {
                     let sums = self.sums(&finer, &curved, index, &samples, row)?;
                     Some((0..finer.frames()).step_by(2).map(|k| sums.error([k, k + 2])).sum::<f64>())
@@ -383,7 +385,7 @@ impl<'a> Bakery<'a> {
                     own: curved.frame.shape(&learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0))),
                     colors: (curved.colors == 0).then(|| curved.frame.colors(sample::own_colors(layer, row.id))),
                 };
-                // Colours that are not finite would show as black; what cannot be drawn is left out.
+                // Colours that are not finite would show as black; what cannot be rendered is left out.
                 if !subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite())) {
                     return Vec::new();
                 }

@@ -13,7 +13,7 @@ use crate::scene::{Camera, Color, Part, Rows, Table, Time};
 /// PSNR where two images are the same, dB: rounding to 8 bits alone would give about 59.
 const SAME: f64 = 99.0;
 
-/// How like the model the baked scene looks.
+/// Similarity of the baked scene to the model.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Likeness {
     /// PSNR of all pixels together, dB.
@@ -92,9 +92,9 @@ pub enum Shown<'a> {
     File(&'a Scene<f32>),
 }
 
-/// Renders the baked scene and the model from these cameras at these times, clamped to the clip, and compares. `progress`
-/// hears how many images of how many are done; `false` ends the comparison with those. `None`: nothing was compared. Errors:
-/// the backend's.
+/// Renders the baked scene and the model from these cameras at these times, clamped to the clip, and compares.
+/// `progress` is called with the finished and the total number of images; `false` ends the comparison with those.
+/// `None`: nothing was compared. Errors: the backend's.
 pub fn compare(
     scene: &Scene<f32>,
     baked: Shown<'_>,
@@ -108,7 +108,7 @@ pub fn compare(
     let (mut sum, mut pixels, mut done) = (0.0, 0.0, 0);
     let mut worst = (f64::INFINITY, 0.0);
     for of_time in shots.chunk_by(|a, b| a.0 == b.0) {
-        // Players stop at the clip's ends; a model goes on beyond them.
+        // Players stop at the clip's ends; a model continues beyond them.
         let time = of_time[0].0.max(scene.clip[0]).min(scene.clip[1]);
         scene.at(Time(time), &mut instant);
         match baked {

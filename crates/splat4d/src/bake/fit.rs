@@ -1,8 +1,8 @@
-//! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its life, halved where they miss.
+//! Fits linear segments to one Gaussian, in the deepest nodes that hold its lifespan; segments that miss are halved.
 
 use super::life::Envelope;
 use super::sample::{GEOMETRY, Row, Samples};
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::shape::{Shape, decompose, difference};
 use super::tree::{Span, Tree};
 use crate::format::playback::Primitive;
@@ -14,11 +14,11 @@ use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
 /// changes its neighbourhood by up to 0.6·d, but with both signs, so that most of it cancels; a wrong opacity does
 /// not, and is held five times as strictly.
 pub(super) const LEVEL_PIXELS: f64 = 8.0;
-/// Weight of a look at which nothing is to be seen: it keeps a line through two frames defined.
+/// Weight of a time sample at which the Gaussian is invisible: it keeps a line through two frames defined.
 const FAINT: f64 = 1e-4;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME_SHAPE: f64 = 1e-5;
-/// The envelope's centre may be so many reaches off a node before rounded velocities would be felt; a piece further
+/// The envelope's centre may be this many reaches away from a node before rounded velocities matter; a segment further
 /// out gets a centre of its own.
 const FAR: f64 = 8.0;
 /// SH coefficients of all channels.
@@ -29,7 +29,7 @@ pub(super) const COLORS: usize = 3 * MAX_COEFFS;
 pub(super) struct Piece {
     /// The node.
     pub span: Span,
-    /// The primitive drawn there.
+    /// The primitive rendered there.
     pub primitive: Primitive,
     /// Largest error over its frames, pixels.
     pub error: f64,
@@ -39,8 +39,8 @@ pub(super) struct Piece {
 #[derive(Clone, Copy)]
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,
-    pub sampling: &'a Lookout,
-    /// Errors of shape and life that need not be improved, pixels.
+    pub sampling: &'a Viewpoints,
+    /// Errors of shape and lifespan that need not be improved, pixels.
     pub tolerance: f64,
     /// Largest error that is not split further, pixels.
     pub accepted: f64,
@@ -51,7 +51,7 @@ pub(super) struct Subject<'a> {
     pub samples: &'a Samples,
     pub row: &'a Row,
     pub life: Envelope,
-    /// Whether its layer comes or goes by a cross-fade.
+    /// Whether its layer fades in or out.
     pub cross_fades: bool,
     /// Learnt rotation and scales: exact where motion leaves shapes alone.
     pub own: Shape,
@@ -59,7 +59,7 @@ pub(super) struct Subject<'a> {
     pub colors: Option<[f32; COLORS]>,
 }
 
-/// One frame's look, in f64.
+/// One time sample, in f64.
 struct FrameSample {
     time: f64,
     mean: [f64; 3],
@@ -69,14 +69,14 @@ struct FrameSample {
 }
 
 impl Fitter<'_> {
-    /// The pieces of one Gaussian in a span, in time order.
+    /// The segments of one Gaussian in a span, in time order.
     pub(super) fn pieces(&self, subject: &Subject<'_>, span: Span) -> Vec<Piece> {
         let mut out = Vec::new();
         self.place(subject, span, &mut out);
         out
     }
 
-    /// Goes down while one half holds all that is to be seen, then fits; a miss goes on in both halves.
+    /// Descends while one half holds the whole visible time, then fits; if the fit misses, continues in both halves.
     fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
         match narrow(self.tree, subject.row.seen, span) {
             Place::Nowhere => return,
@@ -85,30 +85,31 @@ impl Fitter<'_> {
         }
         match (self.fit(subject, span), self.tree.split(span)) {
             (Some((primitive, error)), _) if error <= self.accepted => out.push(Piece { span, primitive, error }),
-            // Where nothing could be fitted a half may still hold a frame that is sound.
+            // Where nothing could be fitted, a half may still hold a valid frame.
             (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
             (Some((primitive, error)), None) => out.push(Piece { span, primitive, error }),
             (None, None) => {}
         }
     }
 
-    /// The best primitive of a node, and its error in pixels. None: not one look is finite, or the node is split whatever its
-    /// shape is.
+    /// The best primitive of a node, and its error in pixels. None: no sample is finite, or the node is split whatever
+    /// its shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
-        let looks = self.looks(subject, span);
+        let samples = self.samples(subject, span);
         let single = span[1] - span[0] == 1;
-        let first = looks.first().filter(|l| !single || l.frame == span[0])?;
-        // The look at a node's end belongs to the next node. The line goes through it, so that motion is whole between
-        // frames too, but a single frame is what it is.
-        let held = if single { &looks[..1] } else { &looks[..] };
+        let first = samples.first().filter(|l| !single || l.frame == span[0])?;
+        // The sample at a node's end belongs to the next node. The line goes through it, so that motion is continuous
+        // between frames too, but a single frame is exact.
+        let held = if single { &samples[..1] } else { &samples[..] };
 
         let weight = |l: &FrameSample| l.alpha + FAINT;
-        let total: f64 = looks.iter().map(weight).sum();
-        let time = looks.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
-        let mean: [f64; 3] = std::array::from_fn(|k| looks.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
-        let spread: f64 = looks.iter().map(|l| weight(l) * (l.time - time).powi(2)).sum();
+        let total: f64 = samples.iter().map(weight).sum();
+        let time = samples.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
+        let mean: [f64; 3] =
+            std::array::from_fn(|k| samples.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
+        let spread: f64 = samples.iter().map(|l| weight(l) * (l.time - time).powi(2)).sum();
         let velocity: [f64; 3] = std::array::from_fn(|k| {
-            let sum: f64 = looks.iter().map(|l| weight(l) * (l.time - time) * (l.mean[k] - mean[k])).sum();
+            let sum: f64 = samples.iter().map(|l| weight(l) * (l.time - time) * (l.mean[k] - mean[k])).sum();
             if spread > 0.0 { sum / spread } else { 0.0 }
         });
 
@@ -139,7 +140,7 @@ impl Fitter<'_> {
         if !single && worst(None) > self.accepted {
             return None;
         }
-        let shape = self.shape(subject, &looks, held, life.center, pixels);
+        let shape = self.shape(subject, &samples, held, life.center, pixels);
         let error = worst(Some(&shape));
         let ends = self.shown(subject, span);
         let share = ((ends[1] - ends[0]) / (self.tree.border(span[1]) - self.tree.border(span[0]))).clamp(0.0, 1.0);
@@ -148,31 +149,31 @@ impl Fitter<'_> {
         sound.then_some((primitive, error))
     }
 
-    /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what is
-    /// seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
+    /// The target shape of a segment's samples. That of a single frame turns on to the next one's, so that what is seen
+    /// between them is whole, where it then misses its own by no more than is allowed, and both by less.
     fn shape(
         &self,
         subject: &Subject<'_>,
-        looks: &[FrameSample],
+        samples: &[FrameSample],
         held: &[FrameSample],
         center: f64,
         pixels: f64,
     ) -> Shape {
         let own = shape(subject, held, center);
-        if held.len() == looks.len() {
+        if held.len() == samples.len() {
             return own;
         }
-        let turning = shape(subject, looks, center);
+        let turning = shape(subject, samples, center);
         let miss = |shape: &Shape, look: &FrameSample| {
             look.alpha * difference(shape.covariance(look.time - center), look.cov) * pixels
         };
-        let worst = |shape: &Shape| looks.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
+        let worst = |shape: &Shape| samples.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
         let allowed = held.iter().all(|l| miss(&turning, l) <= self.tolerance);
         if allowed && worst(&turning) < worst(&own) { turning } else { own }
     }
 
-    /// The finite looks at a span's frames, its end included.
-    fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
+    /// The finite samples at a span's frames, its end included.
+    fn samples(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
         let [first, last] = subject.row.frames;
         let look = |frame: usize| {
             let v = subject.samples.at(subject.row, frame);
@@ -192,24 +193,24 @@ impl Fitter<'_> {
         [subject.row.seen[0].max(self.tree.border(span[0])), subject.row.seen[1].min(self.tree.border(span[1]))]
     }
 
-    /// Envelope and opacity: the life as it was learnt, or, where that is not what is seen, a constant.
-    fn life(&self, subject: &Subject<'_>, span: Span, looks: &[FrameSample]) -> (Envelope, f64) {
+    /// Envelope and opacity: the learnt lifespan, or a constant where the samples differ from it.
+    fn life(&self, subject: &Subject<'_>, span: Span, samples: &[FrameSample]) -> (Envelope, f64) {
         let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
         let still = Envelope::forever(0.5 * (from + to));
-        let range = looks.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
+        let range = samples.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
         let constant = (0.5 * (range[0] + range[1])).clamp(0.0, 1.0);
         let own = subject.life;
         if own.is_forever() {
-            return self.or_tail(subject, looks, (still, constant), 0.5 * (range[1] - range[0]));
+            return self.or_tail(subject, samples, (still, constant), 0.5 * (range[1] - range[0]));
         }
         let (mut above, mut below) = (0.0, 0.0);
-        for look in looks {
+        for look in samples {
             let sigma = own.sigma(look.time);
             above += look.alpha * sigma * (look.alpha + FAINT);
             below += sigma * sigma * (look.alpha + FAINT);
         }
         let opacity = if below > 0.0 { (above / below).clamp(0.0, 1.0) } else { 0.0 };
-        let miss = looks.iter().map(|l| (opacity * own.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max);
+        let miss = samples.iter().map(|l| (opacity * own.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max);
         let ends = self.shown(subject, span);
         let reach = (own.half + 3.0 * own.softness).min(to - from);
         let far = ends.iter().map(|t| (t - own.center).abs()).fold(0.0, f64::max) > FAR * reach;
@@ -217,14 +218,14 @@ impl Fitter<'_> {
         let enough = LEVEL_PIXELS * flat <= self.tolerance;
         let (life, opacity, miss) =
             if (far && enough) || flat < miss { (still, constant, flat) } else { (own, opacity, miss) };
-        self.or_tail(subject, looks, (life, opacity), miss)
+        self.or_tail(subject, samples, (life, opacity), miss)
     }
 
-    /// What was found, or one side of an envelope where a cross-fade makes that a better fit.
+    /// The found envelope, or one side of an envelope where a cross-fade makes that a better fit.
     fn or_tail(
         &self,
         subject: &Subject<'_>,
-        looks: &[FrameSample],
+        samples: &[FrameSample],
         found: (Envelope, f64),
         miss: f64,
     ) -> (Envelope, f64) {
@@ -232,20 +233,20 @@ impl Fitter<'_> {
             return found;
         }
         let of = |&(life, opacity): &(Envelope, f64)| {
-            looks.iter().map(|l| (opacity * life.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max)
+            samples.iter().map(|l| (opacity * life.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max)
         };
-        tail(looks).filter(|tail| of(tail) < miss).unwrap_or(found)
+        tail(samples).filter(|tail| of(tail) < miss).unwrap_or(found)
     }
 }
 
-/// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line through
-/// √(−2 ln(α/α_max)).
-fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
-    /// Looks at which next to nothing has fallen yet, or next to nothing is left, say little of the slope.
+/// An envelope about the strongest sample that falls as the samples do: σ = exp(−½y²), y = (x − h)/s beyond h, is a
+/// line through √(−2 ln(α/α_max)).
+fn tail(samples: &[FrameSample]) -> Option<(Envelope, f64)> {
+    /// Samples close to full strength or close to zero, carry little information about the slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
-    let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
+    let peak = samples.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
     let share = |l: &FrameSample| l.alpha / peak.alpha;
-    let told: Vec<[f64; 3]> = looks
+    let told: Vec<[f64; 3]> = samples
         .iter()
         .filter(|l| TELLING.contains(&share(l)))
         .map(|l| [(l.time - peak.time).abs(), (-2.0 * share(l).ln()).sqrt(), share(l)])
@@ -254,7 +255,7 @@ fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     let mean = |k: usize| told.iter().map(|t| t[2] * t[k]).sum::<f64>() / total;
     let (x, y) = (mean(0), mean(1));
     let spread: f64 = told.iter().map(|t| t[2] * (t[0] - x).powi(2)).sum();
-    // Through the strongest look, where there is but one other.
+    // Through the strongest sample, where there is but one other.
     let slope =
         if spread > 0.0 { told.iter().map(|t| t[2] * (t[0] - x) * (t[1] - y)).sum::<f64>() / spread } else { y / x };
     let half = (x - y / slope).max(0.0);
@@ -263,34 +264,34 @@ fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     sound.then_some((Envelope { center: peak.time, half, softness }, peak.alpha))
 }
 
-/// The shape: as it was learnt where that is what is seen, else turning at a steady rate.
-fn shape(subject: &Subject<'_>, looks: &[FrameSample], center: f64) -> Shape {
+/// The shape: the learnt one where the samples agree with it, else turning at a steady rate.
+fn shape(subject: &Subject<'_>, samples: &[FrameSample], center: f64) -> Shape {
     let own = subject.own;
     let same = |cov: [f64; 6], other: [f64; 6]| {
         let trace = (cov[0] + cov[3] + cov[5]).abs();
         cov.iter().zip(other).all(|(a, b)| (a - b).abs() <= SAME_SHAPE * trace)
     };
     let learnt = own.covariance(0.0);
-    if looks.iter().all(|l| same(l.cov, learnt)) {
+    if samples.iter().all(|l| same(l.cov, learnt)) {
         return own;
     }
-    let clearest = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha)).expect("a fit has looks");
+    let clearest = samples.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha)).expect("a fit has samples");
     let start = if same(clearest.cov, learnt) { own } else { decompose(clearest.cov) };
-    if looks.iter().all(|l| same(l.cov, clearest.cov)) {
+    if samples.iter().all(|l| same(l.cov, clearest.cov)) {
         return start;
     }
-    let seen: Vec<_> = looks.iter().map(|l| (l.time - center, l.alpha + FAINT, l.cov)).collect();
+    let seen: Vec<_> = samples.iter().map(|l| (l.time - center, l.alpha + FAINT, l.cov)).collect();
     start.fit(&seen)
 }
 
 /// SH coefficients: the Gaussian's own, or the weighted mean of what is seen.
-fn colors(subject: &Subject<'_>, looks: &[FrameSample]) -> [f32; COLORS] {
+fn colors(subject: &Subject<'_>, samples: &[FrameSample]) -> [f32; COLORS] {
     if let Some(own) = subject.colors {
         return own;
     }
     let mut sum = [0.0f64; COLORS];
-    let total: f64 = looks.iter().map(|l| l.alpha + FAINT).sum();
-    for look in looks {
+    let total: f64 = samples.iter().map(|l| l.alpha + FAINT).sum();
+    for look in samples {
         let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
         sum.iter_mut().zip(seen).for_each(|(s, c)| *s += (look.alpha + FAINT) / total * f64::from(*c));
     }
@@ -306,7 +307,8 @@ fn color_difference(a: &[f32; COLORS], b: &[f32]) -> f64 {
     (square.into_iter().fold(0.0, f64::max) / (4.0 * std::f64::consts::PI)).sqrt()
 }
 
-/// Assembles a primitive. `area` weighs its importance: pixels² a unit² times the share of the node in which it lives.
+/// Assembles a primitive. `area` weighs its importance: pixels² per unit² times the share of the node in which it is
+/// alive.
 pub(super) fn primitive(
     mean: [f64; 3],
     life: &Envelope,
@@ -318,7 +320,7 @@ pub(super) fn primitive(
 ) -> Primitive {
     let mut sizes = shape.scales;
     sizes.sort_by(f64::total_cmp);
-    // How much of the image it covers, how strongly, for how long: what is missed most comes first.
+    // How much of the image it covers, how strongly, for how long: the most important come first.
     let importance = (opacity * sizes[2] * sizes[1] * area) as f32;
     Primitive {
         mean,
@@ -338,9 +340,9 @@ pub(super) fn primitive(
     }
 }
 
-/// How a node and a Gaussian's time relate to each other.
+/// Relation of a node to a Gaussian's visible time.
 pub(super) enum Place {
-    /// Nothing is to be seen in the node.
+    /// The Gaussian is invisible in the node.
     Nowhere,
     /// All of it is in this half, and the node is longer than a segment.
     In(Span),
@@ -365,7 +367,7 @@ pub(super) fn narrow(tree: &Tree, seen: [f64; 2], span: Span) -> Place {
     Place::Here
 }
 
-/// The span in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen.
+/// The span of a Gaussian with linear motion: the deepest that holds its whole visible time.
 pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Option<Span> {
     let mut span = tree.root();
     loop {
@@ -381,11 +383,11 @@ pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Option<Span> {
 pub(super) fn seen(tree: &Tree, [from, to]: [f64; 2]) -> Option<[f64; 2]> {
     let clip = tree.clip();
     let seen = [from.max(clip[0]), to.min(clip[1])];
-    // NaN compares as never: such rows are not drawn by the renderer either.
+    // NaN compares as never: such rows are not rendered by the renderer either.
     (from <= to && seen[0] <= seen[1]).then_some(seen)
 }
 
-/// A Gaussian as faint as this is not drawn at any time.
+/// A Gaussian fainter than this is never rendered.
 pub(super) fn is_visible(opacity: f64) -> bool {
     opacity >= ALPHA_MIN
 }

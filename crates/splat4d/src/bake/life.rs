@@ -1,15 +1,16 @@
-//! Every kind of life as the file's one envelope.
+//! Every kind of lifespan as the file's one envelope.
 
 use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
-/// A half-width or softness above this is for ever, seconds: three years, as intervals that stand for it have thirty.
+/// A half-width or softness above this counts as infinite, seconds: three years; intervals that represent infinity have
+/// thirty.
 const FOR_EVER: f64 = 1e8;
 /// A softness below this is an edge, seconds.
 const SHARP: f64 = 1e-9;
 
-/// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 for ever where `half` is infinite.
+/// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 forever where `half` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Envelope {
     /// Seconds.
@@ -21,7 +22,7 @@ pub(super) struct Envelope {
 }
 
 impl Envelope {
-    /// For ever, with motion counted from `center`.
+    /// An infinite lifespan, with motion counted from `center`.
     pub(super) fn forever(center: f64) -> Self {
         Self { center, half: f64::INFINITY, softness: 1.0 }
     }
@@ -37,7 +38,7 @@ impl Envelope {
     }
 }
 
-/// The lives of a layer's Gaussians.
+/// The lifespans of a layer's Gaussians.
 pub(super) struct Lives<'a> {
     table: std::borrow::Cow<'a, Table<f32>>,
     kind: LifeKind,
@@ -62,7 +63,7 @@ impl<'a> Lives<'a> {
         Envelope { softness: if own.softness < SHARP { SHARP } else { own.softness }, ..own }
     }
 
-    /// Whether lives have centres.
+    /// Whether the lifespans have centres.
     pub(super) fn has_centers(&self) -> bool {
         self.table.width() > 0
     }

@@ -6,9 +6,10 @@
 //! linearly to the next frame (key states). Linear motion is copied and not fitted.
 //!
 //! [`Cut`] decides where to split: [`bake`] splits every segment that misses by more than a tolerance in pixels.
-//! [`Bakery`] knows the curve of segments and image error (`rate.rs`), so that a budget can be met.
+//! [`Bakery`] measures the curve of segments and image error (`rate.rs`) to meet a budget.
 //!
-//! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times Gaussians.
+//! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times
+//! Gaussians.
 
 mod bakery;
 mod compare;
@@ -37,18 +38,19 @@ pub(crate) use compare::Moment;
 pub use compare::{Likeness, Shown, compare};
 
 /// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
-/// less than 40 dB can show (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
+/// less than 40 dB can show (measured; see the tests), at a fraction of the segments that a tenth of it would need.
 pub const TOLERANCE: f64 = 0.25;
 /// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
 pub const SEGMENT: f64 = 1.0;
-/// Default of [`Options::looks`]: what players show. A network between the frames of a slow take is no line.
-pub const LOOKS: f64 = 30.0;
+/// Default of [`Options::sample_rate`]: the frame rate of players. Between the frames of a slow capture a network is
+/// not linear.
+pub const SAMPLE_RATE: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
-/// Default of [`Options::renders`]: as many as pay off.
+/// Default of [`Options::renders`]: more do not improve the result.
 pub(crate) const RENDERS: usize =
     if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
-/// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames a second.
+/// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames per second.
 pub(crate) const SAMPLES: usize = 24_000_000;
 
 /// Options of baking.
@@ -58,15 +60,15 @@ pub struct Options {
     pub tolerance: f64,
     /// About how long a segment lasts, seconds.
     pub segment: f64,
-    /// Time samples of the model a second, at least; each of the clip's frames is one, as far as `samples` allows.
-    pub looks: f64,
+    /// Time samples of the model per second, at least; each of the clip's frames is one, as far as `samples` allows.
+    pub sample_rate: f64,
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.
     pub samples: usize,
     /// Most renders each, of fixed cameras and of one that moves, that measure how strongly images react to errors:
     /// bounds the time as well.
     pub renders: usize,
-    /// The clip is played so many times over.
+    /// The clip is played this many times over.
     pub repeat: usize,
     /// The cameras whose pixels count, at all times. No camera and no path: a 1080p image that the scene fills.
     pub cameras: Vec<Camera>,
@@ -81,7 +83,7 @@ impl Default for Options {
         Self {
             tolerance: TOLERANCE,
             segment: SEGMENT,
-            looks: LOOKS,
+            sample_rate: SAMPLE_RATE,
             samples: SAMPLES,
             renders: RENDERS,
             repeat: 1,
@@ -95,7 +97,7 @@ impl Default for Options {
 /// A baked scene.
 #[derive(Clone, Debug)]
 pub struct Baked {
-    /// Primitives by the span in which they are drawn; spans rise, longer ones first.
+    /// Primitives by the span in which they are rendered; spans rise, longer ones first.
     pub nodes: Vec<Node>,
     /// First and last second, all rounds.
     pub clip: [f64; 2],
@@ -143,9 +145,9 @@ pub struct Errors {
     pub counts: Vec<usize>,
 }
 
-/// Bakes a scene with [`Options::tolerance`]. `progress` hears how many Gaussians of how many are done.
+/// Bakes a scene with [`Options::tolerance`]. `progress` is called with the finished and the total number of Gaussians.
 ///
-/// Errors: a scene with a pixel head; options out of range; a clip that is no clip; a model that would become too many
+/// Errors: a scene with a pixel head; options out of range; an invalid clip; a model that would become too many
 /// primitives.
 pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
     Bakery::new(scene, options)?.bake(Cut::Tolerance(options.tolerance), progress)

@@ -1,10 +1,10 @@
-//! Ranks primitives by what images lack without them, so that a part of a file looks like the whole.
+//! Ranks primitives by the change of images without them, so that a part of a file looks like the whole.
 //!
-//! What a primitive covers states little: a large one behind a wall, or one of its neighbours' colour, is not missed. Renders
-//! of the baked scene at times spread over the clip measure what the removal of each primitive changes. A short life lies
-//! between two renders or on one by chance; therefore the change is measured for each unit of squared opacity, and then
-//! weighed by the time for which the primitive is there. A static primitive and one that is there for a tenth of the clip
-//! then count by what they add to the mean squared error of all frames.
+//! The area of a primitive is a poor measure: a large one behind a wall, or one of its neighbours' colour, is not
+//! missed. Renders of the baked scene at times spread over the clip measure what the removal of each primitive changes.
+//! A short lifespan lies between two renders or on one by chance; therefore the change is measured for each unit of
+//! squared opacity, and then weighed by the time for which the primitive is there. A static primitive and one that is
+//! there for a tenth of the clip then count by what they add to the mean squared error of all frames.
 
 use super::Options;
 use crate::format::playback::{Node, Primitive, as_layers};
@@ -13,7 +13,7 @@ use crate::render::{Importance, RenderConfig, Shot};
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::{Camera, Time};
 
-/// Renders a second of the clip: a life of 0.1 s is met twice.
+/// Renders a second of the clip: a lifespan of 0.1 s is sampled twice.
 const A_SECOND: f64 = 20.0;
 /// Fewest renders, and most products of renders and Gaussians: some seconds of one core.
 const FEWEST: usize = 12;
@@ -28,7 +28,7 @@ const UNSEEN: f64 = 0.02;
 /// step with time.
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
-/// What was measured for one primitive.
+/// Measurements of one primitive.
 #[derive(Clone, Copy, Default)]
 struct ImageChange {
     /// Change of the image, mean squared error, and squared opacity, over the renders at whose time it is there.
@@ -108,7 +108,7 @@ fn weigh(node: &mut Node, seen: &[ImageChange]) {
     }
 }
 
-/// Mean over the node's time of the squared opacity: in the middle of the life 1, Gaussian tails on both sides.
+/// Mean over the node's time of the squared opacity: in the middle of the lifespan 1, Gaussian tails on both sides.
 fn presence(p: &Primitive, from: f64, to: f64) -> f64 {
     let opacity = f64::from(p.opacity);
     let life = if p.half_width.is_finite() {
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
     use crate::math::Se3;
 
-    /// One that lives for `half` seconds about the middle of a second.
+    /// One with a lifespan of `half` seconds about the middle of a second.
     fn primitive(mean: [f64; 3], size: f32, half: f64, color: f32) -> Primitive {
         Primitive {
             mean,
@@ -150,8 +150,8 @@ mod tests {
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 0.8, 64, 48);
         let options = Options { cameras: vec![camera], ..Options::default() };
-        // A white wall, a large hidden one behind it, one of its colour before it, a small black one, and that for a tenth
-        // of the time.
+        // A white wall, a large hidden one behind it, one of its colour before it, a small black one, and that for a
+        // tenth of the time.
         let primitives = vec![
             primitive([0.0, 0.0, 0.0], 2.0, f64::INFINITY, 1.0),
             primitive([0.0, 0.0, 6.0], 1.5, f64::INFINITY, 0.0),

@@ -1,10 +1,10 @@
 //! Rate and distortion: how many segments a Gaussian needs for how small an error of the images.
 //!
-//! Every node of the tree of time spans has the error that one segment leaves there: closed forms of running sums, so that
-//! a node costs the same however many looks it holds. For a price λ of a segment the best cut of the tree is known from its
-//! leaves upwards (a node is cut where its halves and their price cost less). Cuts at all prices of a ladder at once give the
-//! curve of the whole scene, on which a budget of segments or a wanted error is a price. (Optimal tree pruning: Chou,
-//! Lookabaugh, Gray 1989.)
+//! Every node of the tree of time spans has the error that one segment leaves there: closed forms of running sums, so
+//! that a node costs the same for any number of samples. For a price λ of a segment the best cut of the tree is known
+//! from its leaves upwards (a node is cut where its halves and their price cost less). Cuts at all prices of a ladder
+//! at once give the curve of the whole scene, on which a budget of segments or a requested error is a price. (Optimal
+//! tree pruning: Chou, Lookabaugh, Gray 1989.)
 
 use super::fit::{Place, narrow};
 use super::life::Envelope;
@@ -19,19 +19,19 @@ pub(super) const PRICES: usize = 32;
 /// could see of a million segments to more than one Gaussian can weigh.
 const LOWEST: f64 = 1e-14;
 const FACTOR: f64 = 2.5;
-/// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² + 2‖·‖²)/16
-/// of a bell, between the values of a change along the axes and of a shear.
+/// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² +
+/// 2‖·‖²)/16 of a bell, between the values of a change along the axes and of a shear.
 const SHAPE: f64 = 0.125;
-/// Axes whose relative difference of squares is below this cannot be distinguished: a shear between them is no turn.
+/// Axes whose relative difference of squares is below this cannot be distinguished: a shear between them is not a turn.
 const ROUND: f64 = 0.05;
 /// A thin axis counts at least as this share of the longest.
 const THIN: f64 = 0.05;
-/// Weight of a look at which nothing is to be seen.
+/// Weight of a sample at which the Gaussian is invisible.
 const FAINT: f64 = 1e-6;
 
-/// Numbers of a look before its colours, whose running sums are kept.
+/// Numbers of a sample before its colours, whose running sums are kept.
 const NUMBERS: usize = 29;
-/// Their places.
+/// Their positions.
 mod at {
     pub(super) const W: usize = 0;
     pub(super) const WT: usize = 1;
@@ -49,7 +49,7 @@ mod at {
     pub(super) const SIGMA_SQUARE: usize = 27;
     pub(super) const COLOR_SQUARE: usize = 28;
 }
-/// Entries of a packed matrix that count twice in its square.
+/// Entries of a packed matrix that occur twice in the full matrix.
 const OFF_DIAGONAL: [usize; 3] = [1, 2, 4];
 
 /// Segments and error at every price.
@@ -57,7 +57,7 @@ const OFF_DIAGONAL: [usize; 3] = [1, 2, 4];
 pub(super) struct Rate {
     /// Segments.
     pub pieces: [f64; PRICES],
-    /// Mean squared error of an image, summed over the looks.
+    /// Mean squared error of an image, summed over the samples.
     pub error: [f64; PRICES],
 }
 
@@ -81,7 +81,7 @@ pub(super) fn price(g: usize) -> f64 {
     LOWEST * FACTOR.powi(g as i32)
 }
 
-/// Running sums of one Gaussian's looks.
+/// Running sums of one Gaussian's samples.
 pub(super) struct Sums<'a> {
     tree: &'a Tree,
     row: &'a Row,
@@ -92,12 +92,13 @@ pub(super) struct Sums<'a> {
     peak: f64,
     colors: usize,
     width: usize,
-    /// [looks + 1, width]
+    /// [samples + 1, width]
     sums: Vec<f64>,
 }
 
 impl<'a> Sums<'a> {
-    /// Sums over the looks at `row`. `weigh` gives the weight of its errors from its clearest look. None: no look is finite.
+    /// Sums over the samples of `row`. `weigh` gives the weight of its errors from its clearest sample. None: no sample
+    /// is finite.
     pub(super) fn new(
         tree: &'a Tree,
         samples: &Samples,
@@ -163,11 +164,12 @@ impl<'a> Sums<'a> {
         Some(Self { tree, row, weight, turns, peak, colors, width, sums })
     }
 
-    /// What one segment over a span leaves, summed over its looks; those at its ends, which its neighbours share, count half.
+    /// The error that one segment over a span leaves, summed over its samples; those at its ends, which its neighbours
+    /// share, count half.
     pub(super) fn error(&self, span: Span) -> f64 {
         let [first, last] = self.row.frames;
         let (a, b) = (first.max(span[0]), last.min(span[1]));
-        // A single frame is what it is, and goes straight on to the next.
+        // A single frame is exact, and moves linearly to the next.
         if span[1] - span[0] <= 1 || a >= b {
             return 0.0;
         }

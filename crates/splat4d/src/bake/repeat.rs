@@ -1,7 +1,8 @@
-//! A clip played many times over: the static background for ever is kept once, all else once a round.
+//! A clip played many times over: the static background is stored once with an infinite lifespan, all else once per
+//! round.
 
 use super::fit::LEVEL_PIXELS;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use crate::format::playback::{Node, Primitive};
 
 /// How a clip is repeated.
@@ -16,7 +17,7 @@ pub(super) struct Rounds {
 
 impl Rounds {
     /// The nodes of all rounds from those of one; the first node must be the root.
-    pub(super) fn spread(&self, nodes: Vec<Node>, sampling: &Lookout, tolerance: f64) -> Vec<Node> {
+    pub(super) fn spread(&self, nodes: Vec<Node>, sampling: &Viewpoints, tolerance: f64) -> Vec<Node> {
         let end = self.first + self.length * self.count as f64;
         let mut root = Node { from: self.first, to: end, primitives: Vec::new() };
         let mut round = nodes;
@@ -52,12 +53,12 @@ impl Rounds {
         out
     }
 
-    /// The primitive as one that stands for ever, where that stays within the tolerance.
-    fn still(&self, p: &Primitive, sampling: &Lookout, tolerance: f64) -> Option<Primitive> {
+    /// The primitive as one with an infinite lifespan, where that stays within the tolerance.
+    fn still(&self, p: &Primitive, sampling: &Viewpoints, tolerance: f64) -> Option<Primitive> {
         let ends = [self.first, self.first + self.length];
         let middle = 0.5 * (ends[0] + ends[1]);
         let mean: [f64; 3] = std::array::from_fn(|k| p.mean[k] + f64::from(p.velocity[k]) * (middle - p.center));
-        // A life is highest in one place and falls from there: its extremes are at the ends or at the centre.
+        // A lifespan is highest at one time and falls from there: its extremes are at the ends or at the centre.
         let mut sigma = [1.0f64, 0.0];
         if p.half_width == f64::INFINITY {
             sigma = [1.0, 1.0];

@@ -1,4 +1,4 @@
-//! A layer examined frame after frame: what the fit is made from.
+//! Time samples of a layer, the input of the fit.
 //!
 //! Rows come in runs that are small enough for all frames of a run to be in memory at once, however long the clip is.
 
@@ -25,7 +25,7 @@ pub(super) struct Row {
     pub seen: [f64; 2],
     /// First and last frame that was examined.
     pub frames: Span,
-    /// Where its samples begin.
+    /// Offset of its samples.
     offset: usize,
 }
 
@@ -63,12 +63,12 @@ impl Framed {
     }
 }
 
-/// All looks at one run of rows.
+/// All samples of one run of rows.
 #[derive(Clone, Debug)]
 pub(super) struct Samples {
     /// The rows, ids rising.
     pub rows: Vec<Row>,
-    /// Numbers a look.
+    /// Numbers per sample.
     width: usize,
     data: Vec<f32>,
 }
@@ -81,7 +81,7 @@ impl Samples {
     }
 }
 
-/// How many SH coefficients (all channels) a look must hold: 0 where the layer's own SH is the colour at all times.
+/// How many SH coefficients (all channels) a sample must hold: 0 where the layer's own SH is the colour at all times.
 pub(super) fn color_width(layer: &Layer<f32>, time: f64) -> usize {
     let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(&[0]), Time(time));
     match layer.part(seen.tape(0)).color {
@@ -103,8 +103,8 @@ pub(super) fn run_length(rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize)
     fits.count().clamp(1, rows.len().max(1))
 }
 
-/// Looks at the rows at every frame at which they can be seen, and at one frame before and after.
-pub(super) fn look(
+/// Samples the rows at every frame at which they are visible, and at one frame before and after.
+pub(super) fn sample_rows(
     layer: &Layer<f32>,
     frame: &Framed,
     rows: &[(usize, [f64; 2])],

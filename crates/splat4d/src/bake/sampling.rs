@@ -1,10 +1,10 @@
-//! How large a length in the world looks to the cameras: the measure of every error.
+//! Lengths in the world as the cameras see them, in pixels: the unit of every error.
 
 use crate::math::median;
 use crate::math::se3::{norm, sub};
 use crate::scene::Camera;
 
-/// Most cameras asked: more of a rig say nothing new.
+/// Most cameras that are used: more of a rig add no information.
 const MAX_CAMERAS: usize = 32;
 /// A camera counts as no nearer than this share of the median distance to the middle: what drifts before a lens must
 /// not be followed to the hundredth of its own width.
@@ -13,9 +13,9 @@ const NEAREST: f64 = 0.2;
 const FOCAL: f64 = 1000.0;
 const DISTANCE: f64 = 2.0;
 
-/// Where cameras stand, and how sharp they see.
+/// Positions and resolutions of the cameras.
 #[derive(Clone, Debug)]
-pub(super) struct Lookout {
+pub(super) struct Viewpoints {
     /// Centre and larger focal length.
     eyes: Vec<([f64; 3], f64)>,
     /// Distances are not below this.
@@ -24,7 +24,7 @@ pub(super) struct Lookout {
     fallback: f64,
 }
 
-impl Lookout {
+impl Viewpoints {
     /// From cameras (may be none) and the means of the scene.
     pub(super) fn new(cameras: &[Camera], means: &[[f64; 3]]) -> Self {
         let median = |mut values: Vec<f64>| median(&mut values).unwrap_or(0.0);
@@ -61,10 +61,10 @@ mod tests {
             camera.intrinsics.fy = 100.0;
             camera
         };
-        let sampling = Lookout::new(&[camera(-4.0), camera(10.0)], &[[0.0; 3]; 5]);
+        let sampling = Viewpoints::new(&[camera(-4.0), camera(10.0)], &[[0.0; 3]; 5]);
         assert!((sampling.pixels([0.0; 3]) - 50.0).abs() < 1e-9);
         assert!(sampling.pixels([0.0, 0.0, 10.0]) < 200.0, "nearness is bounded");
-        assert!(Lookout::new(&[], &[[0.0; 3], [1.0, 0.0, 0.0]]).pixels([0.0; 3]).is_finite());
-        assert!(Lookout::new(&[], &[]).pixels([0.0; 3]).is_finite());
+        assert!(Viewpoints::new(&[], &[[0.0; 3], [1.0, 0.0, 0.0]]).pixels([0.0; 3]).is_finite());
+        assert!(Viewpoints::new(&[], &[]).pixels([0.0; 3]).is_finite());
     }
 }

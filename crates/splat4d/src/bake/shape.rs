@@ -2,11 +2,11 @@
 
 use crate::math::{quat, sym3};
 
-/// Gauss-Newton steps: a handful is the rule; what takes more is split anyway.
+/// Gauss-Newton steps: usually a few; spans that need more are split anyway.
 const STEPS: usize = 12;
 /// Two scales whose squares differ by less than this share of the largest: a turn between them cannot be seen.
 const ROUND: f64 = 1e-4;
-/// Largest change of a step, radians (and of log scales): beyond it the linear part means nothing.
+/// Largest change of a step, radians (and of log scales): beyond it the linear part is invalid.
 const STRIDE: f64 = 0.6;
 /// A step smaller than this changes nothing that can be seen.
 const STILL: f64 = 1e-7;
@@ -41,20 +41,20 @@ impl Shape {
     ///
     /// In the frame of the shape's own axes a small turn φ shows off the diagonal, M_ij = φ_k (λ_i − λ_j), and a change
     /// of scale on it, so that each number is a weighted line fit of its own.
-    pub(super) fn fit(mut self, looks: &[(f64, f64, [f64; 6])]) -> Self {
-        let total: f64 = looks.iter().map(|l| l.1).sum();
-        let mean = looks.iter().map(|l| l.1 * l.0).sum::<f64>() / total;
-        let spread: f64 = looks.iter().map(|l| l.1 * (l.0 - mean).powi(2)).sum();
+    pub(super) fn fit(mut self, samples: &[(f64, f64, [f64; 6])]) -> Self {
+        let total: f64 = samples.iter().map(|l| l.1).sum();
+        let mean = samples.iter().map(|l| l.1 * l.0).sum::<f64>() / total;
+        let spread: f64 = samples.iter().map(|l| l.1 * (l.0 - mean).powi(2)).sum();
         let residual = |shape: &Self| -> f64 {
             let one = |l: &(f64, f64, [f64; 6])| {
                 let model = shape.covariance(l.0);
                 l.1 * (0..6).map(|k| (model[k] - l.2[k]).powi(2)).sum::<f64>()
             };
-            looks.iter().map(one).sum()
+            samples.iter().map(one).sum()
         };
         let (mut best, mut pace) = (residual(&self), 1.0);
         for _ in 0..STEPS {
-            let (next, moved) = self.step(looks, [total, mean, spread], pace);
+            let (next, moved) = self.step(samples, [total, mean, spread], pace);
             let now = residual(&next);
             if now < best {
                 (self, best, pace) = (next, now, f64::min(1.0, 2.0 * pace));
@@ -68,14 +68,14 @@ impl Shape {
         self
     }
 
-    /// One step, `pace` times as long as the linear part states, and how far it went (radians).
-    fn step(&self, looks: &[(f64, f64, [f64; 6])], [total, mean, spread]: [f64; 3], pace: f64) -> (Self, f64) {
+    /// One step, `pace` times as long as that of the linear part, and its length (radians).
+    fn step(&self, samples: &[(f64, f64, [f64; 6])], [total, mean, spread]: [f64; 3], pace: f64) -> (Self, f64) {
         let mut out = *self;
         let lambda = self.scales.map(|s| s * s);
         let largest = lambda.iter().fold(0.0, |a: f64, &b| a.max(b));
         // Per axis k: the mean of M and its slope, for the pair (i, j) behind the axis; and the diagonal's mean.
         let (mut level, mut slope, mut size) = ([0.0; 3], [0.0; 3], [0.0; 3]);
-        for &(delta, weight, cov) in looks {
+        for &(delta, weight, cov) in samples {
             let m = inside(&self.rotation(delta), cov);
             let off = [m[4], m[2], m[1]];
             for k in 0..3 {
@@ -90,7 +90,7 @@ impl Shape {
         let turned = |m: [f64; 3], most: f64| -> [f64; 3] {
             std::array::from_fn(|k| pace * (m[k] * gap[k] / (gap[k] * gap[k] + ridge)).clamp(-most, most))
         };
-        let reach = looks.iter().map(|l| (l.0 - mean).abs()).fold(0.0, f64::max);
+        let reach = samples.iter().map(|l| (l.0 - mean).abs()).fold(0.0, f64::max);
         let (level, rate) = (turned(level, STRIDE), turned(slope, STRIDE / reach.max(f64::MIN_POSITIVE)));
         let at_zero: [f64; 3] = std::array::from_fn(|k| level[k] - rate[k] * mean);
         let world = self.rotation(0.0);
@@ -151,21 +151,21 @@ mod tests {
             let scales = std::array::from_fn(|k| (0.7 * rng.normal(10 + k as u64)).exp());
             let turn = std::array::from_fn(|k| 0.6 * rng.normal(20 + k as u64));
             let truth = Shape { quat, scales, turn };
-            let looks: Vec<_> =
+            let samples: Vec<_> =
                 (-5..=5).map(|k| 0.1 * f64::from(k)).map(|d| (d, 1.0 - d * d, truth.covariance(d))).collect();
-            let found = decompose(looks[5].2).fit(&looks);
+            let found = decompose(samples[5].2).fit(&samples);
             let size = scales.iter().fold(0.0, |a: f64, &b| a.max(b));
             let off = |l: &(f64, f64, [f64; 6])| difference(found.covariance(l.0), l.2) / size;
-            lost += usize::from(looks.iter().map(off).fold(0.0, f64::max) > 1e-3);
+            lost += usize::from(samples.iter().map(off).fold(0.0, f64::max) > 1e-3);
         }
-        // Half a turn in a second about an axis that hardly shows has wrong answers nearby; such a span is split.
+        // Half a turn in a second about an axis that hardly shows has wrong solutions nearby; such a span is split.
         assert!(lost <= 2, "{lost} of 40 were not found");
     }
 
     #[test]
     fn balls_do_not_spin() {
-        let looks: Vec<_> = (0..9).map(|k| (0.1 * f64::from(k), 1.0, [0.04, 1e-9, 0.0, 0.04, -1e-9, 0.04])).collect();
-        let found = decompose(looks[0].2).fit(&looks);
+        let samples: Vec<_> = (0..9).map(|k| (0.1 * f64::from(k), 1.0, [0.04, 1e-9, 0.0, 0.04, -1e-9, 0.04])).collect();
+        let found = decompose(samples[0].2).fit(&samples);
         assert!(found.turn.iter().all(|w| w.abs() < 1e-3), "{:?}", found.turn);
         assert!(found.scales.iter().all(|s| (s - 0.2).abs() < 1e-6));
     }

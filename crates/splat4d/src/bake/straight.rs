@@ -1,9 +1,9 @@
-//! Motion that is a straight line already: its primitives are read off the parameters, exactly and at once.
+//! Linear motion: primitives are computed from the parameters exactly, without samples.
 
 use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
 use super::sample::own_colors;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::shape::Shape;
 use super::tree::Tree;
 use crate::layers::Layer;
@@ -15,12 +15,12 @@ use crate::scene::{GEOMETRY, Key};
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Line {
     velocities: Option<Key>,
-    /// Origin of Δ for Gaussians that live for ever.
+    /// Origin of Δ for Gaussians that have infinite lifespans.
     origin: f64,
 }
 
 impl Line {
-    /// The layer's motion, where it is straight and its opacities are those of its lives.
+    /// The layer's motion, where it is straight and its opacities are those of its lifespans.
     pub(super) fn of(layer: &Layer<f32>) -> Option<Self> {
         let motion = layer.motion.polynomial().filter(|p| p.is_straight() && !layer.cross_fades())?;
         Some(Self { velocities: motion.velocities, origin: motion.origin })
@@ -34,7 +34,7 @@ impl Line {
         id: usize,
         span: [f64; 2],
         tree: &Tree,
-        sampling: &Lookout,
+        sampling: &Viewpoints,
     ) -> Option<Piece> {
         let seen = seen(tree, span)?;
         let node = home(tree, seen)?;
@@ -51,7 +51,7 @@ impl Line {
         }
         let origin = if lives.has_centers() { own.center } else { self.origin };
         let [from, to] = [tree.border(node[0]), tree.border(node[1])];
-        // For ever counts from the middle of the node: nothing is ever further from it than half the node.
+        // Infinite lifespans count from the middle of the node: nothing is further from it than half the node.
         let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
         let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
         let shown = [seen[0].max(from), seen[1].min(to)];
@@ -62,7 +62,7 @@ impl Line {
     }
 }
 
-/// Rotation and scales as they are learnt.
+/// Learnt rotation and scales.
 pub(super) fn learnt(row: &[f32; 11]) -> Shape {
     let q = std::array::from_fn(|k| f64::from(row[QUAT + k]));
     let scales = std::array::from_fn(|k| f64::from(row[LOG_SCALE + k]).exp());

@@ -1,7 +1,7 @@
-//! The primitives of the layers so far, and how they become nodes.
+//! Collects the primitives of the layers and makes nodes of them.
 
 use super::fit::Piece;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::tree::Span;
 use super::{Errors, TOLERANCE};
 use crate::format::playback::{Node, Primitive, primitives};
@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 /// Most primitives of a scene: about 3 GB of memory while baking, 300 MB of file.
 const MAX_PRIMITIVES: usize = 10_000_000;
 
-/// Primitives and statistics of the layers so far.
+/// Primitives and statistics of the processed layers.
 #[derive(Default)]
 pub(super) struct Tally {
     /// By span of the tree, and which of the windows cuts it.
@@ -26,7 +26,7 @@ pub(super) struct Tally {
 }
 
 impl Tally {
-    /// Adds all pieces of one Gaussian of a layer that is seen during `window`.
+    /// Adds all segments of one Gaussian of a layer that is seen during `window`.
     pub(super) fn add(&mut self, window: [f64; 2], pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
         let place = match self.windows.iter().position(|w| *w == window) {
             Some(place) => place,
@@ -66,8 +66,8 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
         .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
 }
 
-/// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the file.
-pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
+/// A layer of a playback file: its segments are kept unchanged in their span. Their importance is not in the file.
+pub(super) fn page(layer: &Layer<f32>, sampling: &Viewpoints, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
     let before = all.len();
     all.retain(|p| is_sound(p) && p.opacity >= crate::layers::ALPHA_MIN as f32);
@@ -87,11 +87,11 @@ pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) ->
     Ok((!all.is_empty()).then_some(Node { from, to, primitives: all }))
 }
 
-/// What is left of a node of a layer that is seen during `window` only.
+/// The remaining part of a node of a layer that is seen during `window` only.
 pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     let (from, to) = (node.from.max(first), node.to.min(last));
     if [from, to] != [node.from, node.to] {
-        // What lives for ever counts from the middle, so that nothing is far from where it was rounded.
+        // What has an infinite lifespan counts from the middle, so that nothing is far from where it was rounded.
         let middle = 0.5 * (from + to);
         for p in node.primitives.iter_mut().filter(|p| p.half_width == f64::INFINITY && p.turn == [0.0; 3]) {
             (0..3).for_each(|k| p.mean[k] += f64::from(p.velocity[k]) * (middle - p.center));
@@ -102,8 +102,8 @@ pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     (from < to).then_some(node)
 }
 
-/// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of one
-/// span are one.
+/// Sorts nodes by their beginning; of those that begin together the longest, which contains the others, is first. Those
+/// of one span are merged.
 pub(super) fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
     nodes.sort_by(|a, b| a.from.total_cmp(&b.from).then(b.to.total_cmp(&a.to)));
     let mut out: Vec<Node> = Vec::with_capacity(nodes.len());

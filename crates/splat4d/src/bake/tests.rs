@@ -87,7 +87,7 @@ fn likeness(scene: &Scene<f32>, baked: &Baked) -> Likeness {
     likeness_after(scene, baked, 0.0)
 }
 
-/// So many frames after frames.
+/// This many frames after frames.
 fn likeness_after(scene: &Scene<f32>, baked: &Baked, part: f64) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| (k as f64 + part) / FPS).collect();
@@ -116,7 +116,7 @@ fn a_cross_fade_is_baked_into_opacities() {
     let faded = baked(&scene, &options(0.25));
     let like = likeness(&scene, &faded);
     assert!(like.worst_psnr > 40.0, "{like:?}");
-    // Looked at in the midst of it: without the fade it is another image.
+    // Rendered in the middle of it: without the fade the image differs.
     scene.layers.iter_mut().for_each(|l| l.cross_fade = [0.0; 2]);
     assert!(likeness(&scene, &faded).worst_psnr < 35.0);
 }
@@ -153,7 +153,7 @@ fn straight_motion_with_every_kind_of_lifespan_is_exact() {
 
 #[test]
 fn the_general_algorithm_bakes_straight_motion_exactly() {
-    // The same scene twice: once as what it is, once behind an opaque model.
+    // The same scene twice: once visible, once behind an opaque model.
     let straight = scene(vec![layer(&spacetime(1, false), LifeKind::GaussHalf, 150, 0.3, 2.4)], 2.4);
     let mut hidden = straight.clone();
     hidden.layers[0].motion = Arc::new(Hidden(straight.layers[0].motion.clone()));
@@ -281,7 +281,7 @@ fn static_gaussians_of_repeated_rounds_are_stored_once() {
     let moving = once.report.primitives - still;
     assert!(thrice.report.primitives == still + 3 * moving && moving > 50);
     assert!((thrice.clip[1] - (2.0 + 29.0 / FPS)).abs() < 1e-9);
-    // The same frame of every round looks the same.
+    // The same frame of every round is the same.
     let mut moment = Moment::default();
     for k in [0, 7, 29] {
         let mut shown = Vec::new();
@@ -331,7 +331,7 @@ fn odd_scenes_bake_or_are_refused() {
         sick.params[LIFE].set(6, 0, f32::NAN);
         sick.params[LIFE].set(7, 1, f32::NAN);
         sick.params[SH].set(8, 2, f32::NAN);
-        // Not sick, but odd: a life without end, one without length, and a leap out of all numbers.
+        // Not sick, but odd: a lifespan without end, one without length, and a leap out of all numbers.
         sick.params[LIFE].set(9, 1, 300.0);
         sick.params[LIFE].set(10, 1, -300.0);
         let velocities = sick.params.find(VELOCITIES).unwrap();
@@ -365,7 +365,8 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
     let like = |file: &Scene<f32>| like_at(file, &times);
     let played = file(&first);
-    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's ends.
+    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's
+    // ends.
     let beyond = like_at(&played, &[scene.clip[0] - 0.5, scene.clip[1] + 0.5]);
     assert!(beyond.worst_psnr > 38.0, "{beyond:?}");
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
@@ -466,7 +467,7 @@ fn the_curve_gives_the_segments_needed_for_each_error() {
         let baked = bakery.bake(Cut::Price(price), &mut |_, _| {}).unwrap();
         let [pieces, error] = curve.at(price);
         assert!((0.9..1.1).contains(&(pieces / baked.report.primitives as f64)), "{pieces} {:?}", baked.report);
-        // Gaussians do not err independently, and fits are not what they are judged by: some decibels.
+        // Gaussians do not err independently, and fits minimise another error: some decibels.
         let psnr = likeness(&scene, &baked).psnr;
         assert!((psnr + 10.0 * error.log10()).abs() < 4.0, "{psnr} dB, foretold {}", -10.0 * error.log10());
     }

@@ -12,8 +12,8 @@ const MAX_FRAMES: f64 = 1_000_000.0;
 const MAX_PARTS: f64 = 32.0;
 
 /// Borders of spans are on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
-/// frames a second, what is called a frame here is a part of one: a player shows the times between them too, and a
-/// model need not be straight there.
+/// frames per second, a frame here is a part of one: a player also shows the times between them, and a model need not
+/// be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
 /// last border is one frame of the clip behind the clip's last second, so that this second is inside.
@@ -29,13 +29,13 @@ pub(super) struct Tree {
 }
 
 impl Tree {
-    /// At least `looks` frames a second, but at most `most` of them (and at least two, where the clip has a length). Errors:
-    /// the clip or the segment's length is no sensible number.
-    pub(super) fn new(clip: [f64; 2], fps: f64, looks: f64, segment: f64, most: usize) -> Result<Self> {
+    /// At least `rate` frames per second, but at most `most` of them (and at least two, where the clip has a length).
+    /// Errors: the clip or the segment's length is out of range.
+    pub(super) fn new(clip: [f64; 2], fps: f64, rate: f64, segment: f64, most: usize) -> Result<Self> {
         let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
         let after = 1.0 / fps;
-        // 30 frames a second are enough where 29.97 are.
-        let fps = fps * (looks / fps - 0.1).ceil().clamp(1.0, MAX_PARTS);
+        // 30 frames per second are enough where 29.97 are.
+        let fps = fps * (rate / fps - 0.1).ceil().clamp(1.0, MAX_PARTS);
         let frames = ((clip[1] - clip[0]) * fps).round() + 1.0;
         if !(1.0..=MAX_FRAMES).contains(&frames) || clip.iter().any(|t| !t.is_finite()) {
             return Err(Error::input(format!("the clip from {} to {} s at {fps} frames/s", clip[0], clip[1]))
@@ -153,11 +153,11 @@ mod tests {
 
     #[test]
     fn low_frame_rates_are_sampled_between_frames() {
-        for (fps, looks, parts) in
+        for (fps, rate, parts) in
             [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
         {
             let last = 11.0 / fps;
-            let tree = Tree::new([0.0, last], fps, looks, 1e9, usize::MAX).unwrap();
+            let tree = Tree::new([0.0, last], fps, rate, 1e9, usize::MAX).unwrap();
             assert_eq!(tree.frames(), 11 * parts + 1, "{fps} frames/s");
             assert!(
                 (0..=11).all(|k| (tree.time(k * parts) - k as f64 / fps).abs() <= 1e-12 * last),

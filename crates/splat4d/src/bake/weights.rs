@@ -1,13 +1,13 @@
 //! How strongly images react to an error of each Gaussian, measured on renders of the model.
 //!
-//! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign may not.
-//! [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian alone. Some
-//! cameras at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian counts when that
-//! camera sees it. What no render sees keeps a share of what its size and opacity would weigh alone, so that it is not
-//! lost for other views.
+//! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign
+//! may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian
+//! alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a Gaussian
+//! counts when that camera sees it. A Gaussian that no render sees keeps a share of the weight that its size and
+//! opacity give, so that it is not lost for other views.
 
 use super::sample::GEOMETRY;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use crate::layers::{Evaluation, Scene};
 use crate::math::sym3;
 use crate::render::{Importance, RenderConfig, Shot};
@@ -21,12 +21,12 @@ pub(super) const STILL_RENDERS: usize = 12;
 pub(super) const PATH_RENDERS: usize = 32;
 /// Longer side of these renders, pixels.
 const SIDE: usize = 480;
-/// Share of an error that counts in every direction, also along a line of sight that no render looked across.
+/// Share of an error that counts in every direction, also along a line of sight that no render crosses.
 const ISOTROPIC: f64 = 0.1;
-/// Share of the weight by size and opacity alone that is kept where no render sees the Gaussian, and of its greatest weight
-/// at times at which the moving camera does not.
+/// Share of the weight by size and opacity alone for Gaussians that no render sees, and of its greatest weight at times
+/// at which the moving camera does not.
 const UNSEEN: f64 = 0.02;
-/// Squared contrast to what is around it that is assumed where none is known, each channel.
+/// Squared contrast to the surroundings, assumed where it is unknown, per channel.
 const CONTRAST: f64 = 0.05;
 /// Low-pass of the projection, pixels² (CONVENTIONS.md).
 const LOW_PASS: f64 = 0.3;
@@ -42,7 +42,7 @@ const FAINT: f64 = 0.02;
 /// Sums over renders for one Gaussian, each divided by its squared opacity there.
 #[derive(Clone, Copy, Debug, Default)]
 struct GaussianSums {
-    /// Second moment of the image's gradient with respect to the mean, mean squared error a unit².
+    /// Second moment of the image's gradient with respect to the mean, mean squared error per unit².
     moment: [f64; 6],
     /// Its trace in units of the Gaussian's own size: mean squared error of all of it.
     energy: f64,
@@ -52,7 +52,7 @@ struct GaussianSums {
     still: [f64; 2],
 }
 
-/// What was measured, by layer and row.
+/// The measurements, by layer and row.
 #[derive(Debug)]
 pub(super) struct Weights {
     seen: Vec<Vec<GaussianSums>>,
@@ -64,7 +64,8 @@ pub(super) struct Weights {
     pixels: f64,
 }
 
-/// The weight of one Gaussian's errors: mean squared error of images for errors of size 1, at the time at which it weighs most.
+/// The weight of one Gaussian's errors: mean squared error of images for errors of size 1, at the time at which it
+/// weighs most.
 #[derive(Clone, Debug)]
 pub(super) struct Weight {
     /// Lower triangle L of its quadratic form of the mean, L Lᵀ, per unit².
@@ -73,7 +74,7 @@ pub(super) struct Weight {
     pub opacity: f64,
     /// For a change of colour by 1.
     pub color: f64,
-    /// The most that it can cost to be somewhere else: it is missing where it should be, and wrong where it is.
+    /// The largest cost of a wrong position: missing at the right one, and wrong at its own.
     pub most: f64,
     /// Its share at other times: seconds and share. Empty: 1 at all times.
     shares: Vec<(f64, f64)>,
@@ -89,8 +90,8 @@ impl Weight {
 }
 
 impl Weights {
-    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), each at most `most`
-    /// times, and measures.
+    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), each at most
+    /// `most` times, and measures.
     pub(super) fn measure(
         scene: &Scene<f32>,
         cameras: &[Camera],
@@ -161,8 +162,8 @@ impl Weights {
         out
     }
 
-    /// The weight of row `row` of a layer that looks like `sample` where it is clearest.
-    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Lookout) -> Weight {
+    /// The weight of row `row` of a layer that renders like `sample` where it is clearest.
+    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Viewpoints) -> Weight {
         let v: [f64; GEOMETRY] = std::array::from_fn(|k| f64::from(sample[k]));
         let square = v[SPLAT_OPACITY] * v[SPLAT_OPACITY];
         let values = sym3::eigen([v[3], v[4], v[5], v[6], v[7], v[8]]).0;

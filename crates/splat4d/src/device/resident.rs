@@ -1,11 +1,11 @@
-//! [`ResidentMotion`]: whether a device can keep a layer, and how it sees it.
+//! [`ResidentMotion`]: whether a device can keep a layer, and its motion in the device's terms.
 
 use crate::layers::Layer;
 use crate::motion::{Polynomial, Slices};
 use crate::render::{KEPT, Moves};
 use crate::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
 
-/// What a device knows of a layer that it can keep: how it moves, and its tables in the order of [`KEPT`].
+/// A layer that a device can keep: its motion and its tables in the order of [`KEPT`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResidentMotion {
     /// How its rows move.
@@ -15,7 +15,7 @@ pub struct ResidentMotion {
 }
 
 impl ResidentMotion {
-    /// As all these times see it; none: no device knows such motion.
+    /// The motion for all these times; none: no device supports it.
     pub fn new(layer: &Layer<f32>, times: &[Time]) -> Option<Self> {
         let life = (layer.life != LifeKind::Infinite).then_some(LIFE);
         let known =

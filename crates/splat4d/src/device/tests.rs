@@ -14,20 +14,21 @@ fn view() -> Camera {
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
 #[test]
-fn the_cpu_is_always_there() {
+fn the_cpu_is_always_available() {
     for device in [Device::Cpu, Device::Auto, Device::Gpu] {
-        let mut opened = open(device, RenderConfig::default(), &Wanted::default(), Tables::Constant);
+        let mut opened = open(device, RenderConfig::default(), &Abilities::default(), Tables::Constant);
         let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
         assert!(draw(&mut opened.backend, &Shot::new(&splats, &camera, BACKGROUND), &mut image).is_none());
         assert_eq!(image.color.data[..7], [0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5]);
-        assert!(opened.why.starts_with("drawing on "), "{}", opened.why);
+        assert!(opened.why.starts_with("rendering on "), "{}", opened.why);
         assert_eq!(opened.fell_back, device != Device::Cpu && opened.backend.name() == "the CPU");
     }
 }
 
 #[test]
 fn work_unsupported_by_the_device_runs_on_the_cpu() {
-    for wanted in [Wanted { head: true, ..Wanted::default() }, Wanted { extra: true, ..Wanted::default() }] {
+    for wanted in [Abilities { head: true, ..Abilities::default() }, Abilities { extra: true, ..Abilities::default() }]
+    {
         let opened = open(Device::Gpu, RenderConfig::default(), &wanted, Tables::Changing);
         assert!(opened.fell_back && opened.backend.can(&wanted).is_ok(), "{}", opened.why);
     }
@@ -41,7 +42,7 @@ struct Failing {
 }
 
 impl Backend for Failing {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         if wanted.extra { Err(refusal("it", "blend further channels")) } else { Ok(()) }
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -113,7 +114,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
     let (with_extra, without) = (returned(cpu(config).as_mut(), &extra), returned(cpu(config).as_mut(), &plain));
     for going_back in [false, true] {
         let mut backend = WithCpu::new(Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back }));
-        // What it refuses is reported once, and does not end it.
+        // Refused work is reported once, and does not end it.
         for _ in 0..2 {
             assert!(returned(&mut backend, &extra) == with_extra);
         }
@@ -122,7 +123,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
         // Its failure is reported too, and nothing of the step is lost.
         assert!(returned(&mut backend, &plain) == without && backend.name() == CPU);
         let notice = backend.notice().expect("it is told");
-        assert!(notice.contains("goes on on the CPU") && notice.contains("the driver is gone"), "{notice}");
+        assert!(notice.contains("continues on the CPU") && notice.contains("the driver is gone"), "{notice}");
         assert!(returned(&mut backend, &plain) == without && backend.notice().is_none());
     }
 }
@@ -131,7 +132,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
 struct Crooked(Renderer<f32>, [f32; 2]);
 
 impl Backend for Crooked {
-    fn can(&self, _: &Wanted) -> Result<()> {
+    fn can(&self, _: &Abilities) -> Result<()> {
         Ok(())
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -209,12 +210,12 @@ fn a_driver_that_fails_the_self_test_is_tried_without_subgroups_and_left_then() 
     }
     let (attempts, opened) = tried(2);
     assert!(attempts == 2 && opened.fell_back && opened.name == CPU && opened.backend.name() == CPU);
-    let first = format!("drawing on the CPU: {whole}: 1: it fails a self-test");
+    let first = format!("rendering on the CPU: {whole}: 1: it fails a self-test");
     assert_eq!(opened.why, first, "what failed first is told");
 }
 
-/// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be drawn by
-/// one backend only, which is 1/255 of what is left of the light there.
+/// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be
+/// rendered by one backend only, which is 1/255 of what is left of the light there.
 const PIXEL: f64 = 5e-3;
 /// Largest root of the mean square of the differences: f32 against f64, and a few such splats.
 const RMS: f64 = 2e-4;
@@ -278,7 +279,7 @@ impl<F: Real> Scene<F> {
         }
     }
 
-    /// The image of a backend, if it can draw it.
+    /// The image of a backend, if it can render it.
     fn drawn(&self, backend: &mut dyn Backend<F>, camera: &Camera, sh_degree: usize, depth: bool) -> Option<Image<F>> {
         let sh = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
         // Harmonics in axes of their own, and in the world's.
@@ -292,7 +293,7 @@ impl<F: Real> Scene<F> {
         let background = BACKGROUND.map(|v| F::of(f64::from(v)));
         let shot = Shot { extra: self.extra.as_ref(), sh_degree, depth, ..Shot::new(&splats, camera, background) };
         let mut image = Image::default();
-        match (backend.can(&shot.wanted()), backend.render(&shot, &mut image)) {
+        match (backend.can(&shot.abilities()), backend.render(&shot, &mut image)) {
             (Ok(()), Ok(())) => Some(image),
             (Err(refused), Err(_)) => {
                 println!("{}: {refused}", backend.name());
@@ -315,7 +316,7 @@ fn differences<F: Real>(a: &Planes<F>, b: &Planes<f64>, unit: f64) -> [f64; 2] {
 fn every_backend_renders_as_the_reference_does() {
     let mut backends = vec![cpu(RenderConfig::default())];
     #[cfg(feature = "gpu")]
-    match gpu(Device::Gpu, RenderConfig::default(), &Wanted::default(), Tables::Changing) {
+    match gpu(Device::Gpu, RenderConfig::default(), &Abilities::default(), Tables::Changing) {
         Ok((gpu, name)) => {
             println!("{name}");
             backends.push(gpu);
@@ -366,7 +367,7 @@ fn every_backend_renders_as_the_reference_does() {
 
 #[test]
 fn the_reference_renderer_refuses_a_backward_pass() {
-    let (mut oracle, wanted) = (Oracle::default(), Wanted { backward: true, ..Wanted::default() });
+    let (mut oracle, wanted) = (Oracle::default(), Abilities { backward: true, ..Abilities::default() });
     let error = oracle.can(&wanted).expect_err("it is a forward alone").to_string();
     assert!(error.contains("the oracle does not take gradients back"), "{error}");
     let (splats, camera, color) = (Splats::default(), view(), Planes::new(3, 2, 3));

@@ -1,4 +1,4 @@
-//! What the steps do to a scene.
+//! Effects of the steps on a scene.
 
 use super::clock::{retime, seen_in, window};
 use super::limits::{Size, check_clip, check_room};
@@ -137,7 +137,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Drag { select, at, nodes, handles, pins } => {
             let (selected, count) = find(select, scene)?;
-            drag::run(scene, &selected, &drag::Asked { at: *at, nodes: *nodes, handles, pins }, context)?;
+            drag::run(scene, &selected, &drag::DragRequest { at: *at, nodes: *nodes, handles, pins }, context)?;
             Ok(count)
         }
         Step::Floaters { strength } => {
@@ -170,15 +170,15 @@ fn keep(scene: &mut Scene<f32>, selected: &Selected, wanted: bool) {
     scene.layers.retain(|l| !l.params.is_empty() || HeadKeys::of(&l.params).is_some());
 }
 
-/// Whether opacity and colour at all times are what geometry and spherical harmonics say, times the life.
-fn tables_say_all(layer: &Layer<f32>) -> bool {
+/// Whether opacity and colour at all times equal geometry and spherical harmonics times the lifespan.
+fn tables_suffice(layer: &Layer<f32>) -> bool {
     layer.motion.polynomial().is_some()
 }
 
 fn recolor(scene: &mut Scene<f32>, selected: &Selected, map: &ColorMap) -> Result<()> {
     let mut others = selected.clone();
     for (layer, selected) in scene.layers.iter_mut().zip(&mut others) {
-        if !tables_say_all(layer) {
+        if !tables_suffice(layer) {
             continue;
         }
         let table = &mut layer.params[SH];
@@ -196,7 +196,7 @@ fn recolor(scene: &mut Scene<f32>, selected: &Selected, map: &ColorMap) -> Resul
 fn fade(scene: &mut Scene<f32>, selected: &Selected, factor: f64) -> Result<()> {
     let mut others = selected.clone();
     for (layer, selected) in scene.layers.iter_mut().zip(&mut others) {
-        if !tables_say_all(layer) {
+        if !tables_suffice(layer) {
             continue;
         }
         let table = &mut layer.params[GEOMETRY];
@@ -276,7 +276,9 @@ fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, cur
 fn retime_part(scene: &mut Scene<f32>, rate: f64, [from, to]: [f64; 2], context: &dyn Context) -> Result<()> {
     span(from, to)?;
     if !(rate != 0.0 && rate.is_finite()) {
-        return Err(Error::input(format!("a rate of {rate}")).remedy("1 is as it is, 0.5 half as fast, -1 backwards"));
+        return Err(
+            Error::input(format!("a rate of {rate}")).remedy("1 keeps the speed, 0.5 halves it, -1 plays backwards")
+        );
     }
     let [start, end] = scene.clip;
     let longer = (to - from) / rate.abs() - (to - from);
@@ -333,7 +335,7 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
         }
         other.clip = other.clip.map(|t| t + later);
     }
-    // Both say where they are in their world, which is taken for one.
+    // Both state their world coordinates, and the worlds are taken as one.
     let mut to = *to;
     if scene.offset != [0.0; 3] && other.offset != [0.0; 3] {
         to.translation = std::array::from_fn(|k| to.translation[k] + other.offset[k] - scene.offset[k]);

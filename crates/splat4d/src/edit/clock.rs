@@ -11,7 +11,7 @@ use crate::{Error, ErrorKind, Result};
 use std::any::Any;
 use std::sync::Arc;
 
-/// The layer as it is seen for from ≤ t < to, without the Gaussians that are not; none where there are none.
+/// The layer restricted to from ≤ t < to, without Gaussians that are invisible then; none where no Gaussian is left.
 pub(super) fn window(layer: &Layer<f32>, [from, to]: [f64; 2]) -> Option<Layer<f32>> {
     let span = [layer.span[0].max(from), layer.span[1].min(to)];
     if span[0] >= span[1] {
@@ -34,16 +34,16 @@ pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
     if span[0] >= span[1] {
         return 0;
     }
-    // As they live, whatever the window: those that live in it.
+    // By lifespan, for any window: those alive in it.
     layer.spans().iter().filter(|[first, last]| first.max(span[0]) <= last.min(span[1])).count()
 }
 
 /// The layer on another clock: what it showed at s = rate·t + offset it shows at t.
 ///
-/// Errors: a filter around a model whose motion hangs on its lives.
+/// Errors: a filter around a model whose motion depends on its lifespans.
 pub(super) fn retime(layer: &mut Layer<f32>, rate: f64, offset: f64) -> Result<()> {
     let outside = |s: f64| (s - offset) / rate;
-    // Before the lives change: models that read them take the same clock in their own tables.
+    // Before the lifespans change: models that read them take the same clock in their own tables.
     layer.motion = retimed(&layer.motion.clone(), rate, offset, layer)?;
     if layer.span != ALWAYS {
         let ends = layer.span.map(outside);
@@ -114,20 +114,20 @@ fn retimed(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f
     if any.is::<Still>() { Ok(motion.clone()) } else { clocked(motion, rate, offset, layer) }
 }
 
-/// A clock around the model, which must not read the lives that are about to change.
+/// A clock around the model, which must not read the lifespans that are about to change.
 fn clocked(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f32>) -> Result<Arc<dyn Motion>> {
-    if reads_lives(motion.as_ref()) && layer.params[LIFE].width() > 0 {
+    if reads_lifespans(motion.as_ref()) && layer.params[LIFE].width() > 0 {
         return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot run on another clock", layer.name))
             .remedy("Bake the scene first; baked scenes can"));
     }
     Ok(Arc::new(Edited::around(motion.clone(), Change::Clock { rate, offset }, &mut layer.params)?))
 }
 
-fn reads_lives(motion: &dyn Motion) -> bool {
+fn reads_lifespans(motion: &dyn Motion) -> bool {
     let any: &dyn Any = motion;
     any.is::<Spacetime>()
-        || Filtered::of(motion).is_some_and(|f| reads_lives(f.inner().as_ref()))
-        || Edited::of(motion).is_some_and(|e| reads_lives(e.inner().as_ref()))
+        || Filtered::of(motion).is_some_and(|f| reads_lifespans(f.inner().as_ref()))
+        || Edited::of(motion).is_some_and(|e| reads_lifespans(e.inner().as_ref()))
 }
 
 fn rising<K>(mut keys: Vec<K>, rate: f64) -> Vec<K> {

@@ -18,12 +18,12 @@ use std::sync::Arc;
 
 /// Nodes by default (SC-GS).
 const NODES: usize = 512;
-/// Rounds of turning and moving: after these no eye sees a difference.
+/// Rounds of turning and moving: more make no visible difference.
 const ROUNDS: usize = 8;
 /// Most times at which nodes are followed.
 const MOST_TIMES: usize = 256;
-/// Nodes that pull a Gaussian, and the next one, whose kernel is taken off theirs so that nothing jumps where neighbours
-/// change.
+/// Nodes that pull a Gaussian, and the next one, whose kernel is taken off theirs so that nothing jumps where
+/// neighbours change.
 const PULLING: usize = 4;
 /// Fainter Gaussians carry no node.
 const OPAQUE: f32 = 0.1;
@@ -34,7 +34,7 @@ pub(super) fn usual_nodes() -> usize {
     NODES
 }
 
-/// What is pulled.
+/// The pulled point.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragHandle {
@@ -43,11 +43,11 @@ pub struct DragHandle {
     /// Its radius; the nearest node is always held.
     #[serde(default)]
     pub radius: f64,
-    /// Where it goes, along broken lines; before the first key and after the last it stays there.
+    /// Its path, piecewise linear, constant before the first and after the last key.
     pub keys: Vec<DragKey>,
 }
 
-/// Where a handle is, from where it would be.
+/// Displacement of a handle.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragKey {
@@ -55,21 +55,21 @@ pub struct DragKey {
     pub t: f64,
     /// Scene units.
     pub by: [f64; 3],
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
 
-/// A drag as it was asked for.
-pub(super) struct Asked<'a> {
+/// A drag as requested.
+pub(super) struct DragRequest<'a> {
     pub at: f64,
     pub nodes: usize,
     pub handles: &'a [DragHandle],
     pub pins: &'a [[f64; 4]],
 }
 
-impl Asked<'_> {
-    fn check_moment(&self, scene: &Scene<f32>) -> Result<()> {
+impl DragRequest<'_> {
+    fn check_time(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
         if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
             return bad(format!("{} s is not in the clip", self.at), "Give a second of the clip as `at`");
@@ -82,7 +82,7 @@ impl Asked<'_> {
 
     fn check(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
-        self.check_moment(scene)?;
+        self.check_time(scene)?;
         let sound = |h: &DragHandle| {
             let numbers = h.keys.iter().flat_map(|k| k.by.into_iter().chain([k.t]));
             !h.keys.is_empty()
@@ -98,7 +98,7 @@ impl Asked<'_> {
         Ok(())
     }
 
-    /// Frames of the clip, thinned out, with all key times and `at`; and the place of `at` among them.
+    /// Frames of the clip, thinned out, with all key times and `at`; and the position of `at` among them.
     fn times(&self, scene: &Scene<f32>) -> (Vec<f64>, usize) {
         let [start, end] = scene.clip;
         let frames = ((end - start) * scene.fps.max(1.0)).round().max(0.0) as usize;
@@ -133,7 +133,12 @@ fn within(nodes: &[[f64; 3]], place: [f64; 3], radius: f64) -> Vec<usize> {
 }
 
 /// Bends the selected Gaussians, which get layers of their own.
-pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>, context: &dyn Context) -> Result<()> {
+pub(super) fn run(
+    scene: &mut Scene<f32>,
+    selected: &Selected,
+    asked: &DragRequest<'_>,
+    context: &dyn Context,
+) -> Result<()> {
     asked.check(scene)?;
     let (times, first) = asked.times(scene);
     let (start, paths) = carried(scene, selected, asked, (&times, first), context)?;
@@ -175,7 +180,7 @@ impl Held {
         Ok(Self { pinned, pulled })
     }
 
-    /// What becomes of nodes at `rest` whose handles are displaced.
+    /// Positions of nodes at `rest` after the handles are displaced.
     fn offsets(&self, elastic: &Elastic, rest: &[[f64; 3]], by: &[[f64; 3]]) -> Result<Vec<NodeOffset>> {
         let mut handles: Vec<Handle> = Vec::new();
         let mut hold = |node: usize, by: [f64; 3]| {
@@ -202,14 +207,14 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
     rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect()
 }
 
-/// A drag under the hand: one time of a scene, of which nodes are pulled again and again. What is shown is what a step
-/// with the same nodes, handles and pins makes of that time; away from the second at which places are meant nearly so,
-/// because who follows which node then depends on their current positions.
+/// An interactive drag: one time of a scene whose nodes are pulled repeatedly. It shows what a step with the same
+/// nodes, handles and pins makes of that time; away from the second at which places are meant nearly so, because who
+/// follows which node then depends on their current positions.
 #[derive(Clone, Debug)]
 pub struct Dragging {
     scene: Scene<f32>,
     elastic: Elastic,
-    /// Where the nodes are meant, and where they are at the time that is shown.
+    /// Defining positions of the nodes, and those at the shown time.
     places: Vec<[f64; 3]>,
     nodes: Vec<[f64; 3]>,
     /// Of the layers that bend: their place, and which nodes pull their rows.
@@ -217,7 +222,7 @@ pub struct Dragging {
 }
 
 impl Dragging {
-    /// Takes hold of what is selected, as it is at second `now`, by nodes whose places are meant at second `at`.
+    /// Grabs the selection at second `now` by nodes whose positions are given at second `at`.
     ///
     /// Errors: as of the step; a scene with a pixel head.
     pub fn new(
@@ -228,9 +233,9 @@ impl Dragging {
         context: &dyn Context,
     ) -> Result<Self> {
         scene.without_head("a drag under the hand")?;
-        let asked = Asked { at, nodes, handles: &[], pins: &[] };
-        asked.check_moment(scene)?;
-        Asked { at: now, ..asked }.check_moment(scene)?;
+        let asked = DragRequest { at, nodes, handles: &[], pins: &[] };
+        asked.check_time(scene)?;
+        DragRequest { at: now, ..asked }.check_time(scene)?;
         // Frame by frame, as a step follows them.
         let between = |t: &f64| (at.min(now)..=at.max(now)).contains(t);
         let mut times: Vec<f64> = asked.times(scene).0.into_iter().filter(between).chain([now]).collect();
@@ -257,24 +262,24 @@ impl Dragging {
         }
         let (paths, times) = ([start.clone()], [at]);
         let bent = Bend { start: &start, paths: &paths, times: &times, at }.around(&mut still, &chosen)?;
-        // The ties are those of the places, as a step has them.
+        // The ties are those of the positions, as in a step.
         let elastic = Elastic::new(&places).at_rest(&start);
         let mut out = Self { scene: still, elastic, places, nodes: start, bent };
         out.fill(&unmoved(&out.nodes));
         Ok(out)
     }
 
-    /// Where the nodes are meant: they define what handles and pins take.
+    /// Defining positions of the nodes: they determine what handles and pins take.
     pub fn places(&self) -> &[[f64; 3]] {
         &self.places
     }
 
-    /// Where the nodes are before anything is pulled.
+    /// Positions of the nodes before any pull.
     pub fn nodes(&self) -> &[[f64; 3]] {
         &self.nodes
     }
 
-    /// The time as it is bent now: the same at any time.
+    /// The deformed scene, constant in time.
     pub fn scene(&self) -> &Scene<f32> {
         &self.scene
     }
@@ -314,7 +319,7 @@ type Carried = (Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>);
 fn carried(
     scene: &Scene<f32>,
     selected: &Selected,
-    asked: &Asked<'_>,
+    asked: &DragRequest<'_>,
     (times, first): (&[f64], usize),
     context: &dyn Context,
 ) -> Result<Carried> {
@@ -348,7 +353,7 @@ pub(super) fn own_nodes<'a>(scene: &'a Scene<f32>, selected: &Selected) -> Optio
 }
 
 /// Nodes at farthest points of the selected Gaussians that can be seen at `at`.
-fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &Asked<'_>) -> Result<Vec<[f64; 3]>> {
+fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &DragRequest<'_>) -> Result<Vec<[f64; 3]>> {
     let mut seen = Evaluation::default();
     scene.at(Time(asked.at), &mut seen);
     let mut carriers = Vec::new();
@@ -378,12 +383,12 @@ struct Bend<'a> {
     at: f64,
 }
 
-/// A layer's place in the scene, and for each of its rows in turn the nodes that pull it, with their shares.
+/// A layer's index in the scene, and for each of its rows the nodes that pull it, with their weights.
 type Pulled = (usize, Vec<(u32, f32)>);
 
 impl Bend<'_> {
-    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which nodes
-    /// pull their rows. It is to be filled.
+    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the positions of those, and
+    /// which nodes pull their rows. It is to be filled.
     fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<Pulled>> {
         let count = self.start.len();
         let neighbours = PULLING.min(count - 1).max(1);
@@ -398,8 +403,8 @@ impl Bend<'_> {
     }
 }
 
-/// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the next
-/// node taken off.
+/// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the
+/// next node taken off.
 fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f32)> {
     // The time of `bend.times` nearest to `at` at which a row is there.
     let spans = layer.spans();
@@ -415,10 +420,10 @@ fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f3
     }
     let radius = spacing(bend.start);
     let mut out = vec![(0, 0.0); spans.len() * neighbours];
-    let questions: Vec<(Rows<'_>, Time)> =
+    let queries: Vec<(Rows<'_>, Time)> =
         asked.iter().zip(bend.times).map(|(ids, t)| (Rows::Some(ids), Time(*t))).collect();
     // Tables without any pull yet: the result is that of the model inside.
-    sweep(layer, &questions, |k, tape| {
+    sweep(layer, &queries, |k, tape| {
         let nodes = &bend.paths[k];
         let one = |j: usize| {
             let x = tape.out().read::<3>(j, 0).map(f64::from);

@@ -1,4 +1,4 @@
-//! What a step may make of a scene: as many Gaussians as memory holds, a clip that can be gone through, finite numbers.
+//! Limits of the scenes that edit steps may produce: Gaussians in memory, length of the clip, finite numbers.
 
 use super::{Context, Step};
 use crate::layers::{Evaluation, Layer, Scene};
@@ -6,15 +6,15 @@ use crate::scene::Time;
 use crate::scene::time::DEFAULT_FPS;
 use crate::{Error, ErrorKind, Result};
 
-/// Bytes that editing, drawing and baking take at once, in those of the scene's tables: the scene before and after a step, and
-/// what a playback file is made of, 450 bytes a Gaussian where a table has 60 to 250.
+/// Bytes that editing, rendering and baking take at once, in those of the scene's tables: the scene before and after a
+/// step, and what a playback file is made of, 450 bytes per Gaussian where a table has 60 to 250.
 const WORKING: u64 = 8;
-/// Most frames of a clip: nine hours at 30 a second. Drawing, baking and sequences go through them.
+/// Most frames of a clip: nine hours at 30 a second. Rendering, baking and sequences go through them.
 const MOST_FRAMES: f64 = 1e6;
 /// Most changes around a model, each inside the next: readers of JSON take a hundred and some levels.
 const MOST_NESTED: usize = 40;
-/// Times of the clip at which it is looked whether all numbers are finite.
-const LOOKS: usize = 3;
+/// Times of the clip at which all numbers are checked to be finite.
+const TIMES: usize = 3;
 
 /// Rows and bytes of some Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -30,7 +30,7 @@ impl Size {
         Self { rows: layer.params.len() as u64, bytes: (tables + masks) as u64 }
     }
 
-    /// Of so many of a layer's Gaussians.
+    /// Of this many of a layer's Gaussians.
     pub(super) fn part(layer: &Layer<f32>, rows: usize) -> Self {
         let all = Self::of(layer);
         let share = rows as f64 / all.rows.max(1) as f64;
@@ -63,8 +63,8 @@ pub(super) fn check_room(size: Size, context: &dyn Context) -> Result<()> {
     Err(Error::new(ErrorKind::Memory, what).remedy("Leave the step out, or delete Gaussians before it"))
 }
 
-/// Refuses steps that surely outgrow memory before the first of them is taken: copies of everything double a scene until a step
-/// removes something. Errors: which step, counted from `before`.
+/// Refuses steps that surely outgrow memory before the first of them is taken: copies of everything double a scene
+/// until a step removes something. Errors: which step, counted from `before`.
 pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, context: &dyn Context) -> Result<()> {
     let mut size = Size::of_all(&scene.layers);
     for (i, step) in steps.iter().enumerate() {
@@ -81,7 +81,7 @@ pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, co
     Ok(())
 }
 
-/// Refuses a clip of so many seconds before anything goes through it.
+/// Refuses a clip of this many seconds before anything iterates over it.
 pub(super) fn check_clip(clip: [f64; 2], fps: f64) -> Result<()> {
     let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
     let seconds = clip[1] - clip[0];
@@ -112,9 +112,9 @@ pub(super) fn check_sound(scene: &Scene<f32>) -> Result<()> {
         return Err(Error::input(what).remedy("Put keys of several steps into one"));
     }
     let mut seen = Evaluation::default();
-    for i in 0..LOOKS {
+    for i in 0..TIMES {
         let [from, to] = scene.clip;
-        let t = from + (to - from) * i as f64 / (LOOKS - 1) as f64;
+        let t = from + (to - from) * i as f64 / (TIMES - 1) as f64;
         scene.at(Time(t), &mut seen);
         for (layer, tape) in scene.layers.iter().zip(seen.tapes()) {
             if tape.out().first_non_finite().is_some() {

@@ -1,4 +1,4 @@
-//! Selections evaluated over time: every Gaussian is examined at some times of its own life.
+//! Selections evaluated over time: every Gaussian is examined at some times of its own lifespan.
 
 use super::select::Expr;
 use super::{Context, Mask};
@@ -11,8 +11,8 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, labels};
 use crate::{Error, Result};
 
-/// Times at which a Gaussian is examined, at most, evenly over its life: a bit each.
-const LOOKS: usize = 8;
+/// Times at which a Gaussian is examined, at most, evenly over its lifespan: a bit each.
+const SAMPLES: usize = 8;
 /// Times of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
 /// Share of the images that have a Gaussian in them in which it must be on the subject: others may hide it, whose
@@ -23,18 +23,18 @@ const ON_SUBJECT: f32 = 0.75;
 /// By layer and Gaussian: whether it is meant.
 pub type Selected = Vec<Vec<bool>>;
 
-/// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the times of its
-/// life that are examined; `ever`, `always` and `at` say otherwise.
+/// Selects in a scene. A predicate of positions holds for a Gaussian where it holds at more than half of the times of
+/// its life that are examined; `ever`, `always` and `at` differ.
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
 pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
-    let looks = Looks::over_lives(scene, expr);
-    let bits = evaluate(expr, scene, &looks, context)?;
-    Ok(most(&bits, &looks))
+    let samples = SceneSamples::over_lifespans(scene, expr);
+    let bits = evaluate(expr, scene, &samples, context)?;
+    Ok(most(&bits, &samples))
 }
 
-/// What is seen of one layer: of row i at [`LOOKS`] places from `LOOKS · i` on, of which `count[i]` are there.
-struct LayerLooks {
+/// Samples of one layer: [`SAMPLES`] entries for row i from `SAMPLES · i` on, of which `count[i]` are used.
+struct LayerSamples {
     count: Vec<u8>,
     means: Vec<[f32; 3]>,
     sizes: Vec<f32>,
@@ -44,17 +44,17 @@ struct LayerLooks {
     seen: Vec<[f64; 2]>,
 }
 
-struct Looks(Vec<LayerLooks>);
+struct SceneSamples(Vec<LayerSamples>);
 
-/// A time, the rows that are examined then, and which of its looks it is for each.
+/// A time, the rows that are examined then, and the index of each row's sample.
 type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
-/// By layer and row: bit i stands for time i of the row.
+/// By layer and row: bit i represents time i of the row.
 type Bits = Vec<Vec<u8>>;
 
-impl Looks {
-    /// Looks spread over lives, on frames.
-    fn over_lives(scene: &Scene<f32>, expr: &Expr) -> Self {
+impl SceneSamples {
+    /// Samples spread over lifespans, on frames.
+    fn over_lifespans(scene: &Scene<f32>, expr: &Expr) -> Self {
         let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { crate::scene::time::DEFAULT_FPS };
         let [start, end] = scene.clip;
         let frames = ((end - start) * fps).round().max(0.0) as usize + 1;
@@ -62,26 +62,27 @@ impl Looks {
         let of = |layer: &Layer<f32>| {
             let seen: Vec<[f64; 2]> = layer.spans().iter().map(|[from, to]| [from.max(start), to.min(end)]).collect();
             let frame = |t: f64| ((t - start) * fps).clamp(0.0, (frames - 1) as f64);
-            // By frame: the rows that are examined then, and the place of that look.
+            // By frame: the rows that are examined then, and the index of that sample.
             let mut asked: Vec<(Vec<u32>, Vec<u8>)> = vec![Default::default(); frames];
-            // Who is never seen is examined nowhere: no predicate of places holds, and its negation does.
+            // A Gaussian that is never seen is examined nowhere: no predicate of positions holds, and its negation
+            // does.
             let mut count = vec![1; seen.len()];
             for (row, [from, to]) in seen.iter().enumerate().filter(|(_, [from, to])| from <= to) {
                 let (first, last) = (frame(*from).ceil() as usize, frame(*to).floor() as usize);
-                // A life between two frames is examined at the nearer one.
+                // A lifespan between two frames is examined at the nearer one.
                 let (first, last) =
                     if first > last { [frame(0.5 * (from + to)).round() as usize; 2].into() } else { (first, last) };
-                let looks = LOOKS.min(last - first + 1);
-                count[row] = looks as u8;
-                for i in 0..looks {
-                    let k = first + (last - first) * i / (looks - 1).max(1);
+                let samples = SAMPLES.min(last - first + 1);
+                count[row] = samples as u8;
+                for i in 0..samples {
+                    let k = first + (last - first) * i / (samples - 1).max(1);
                     asked[k].0.push(row as u32);
                     asked[k].1.push(i as u8);
                 }
             }
             let asked: Vec<_> = asked.into_iter().enumerate().filter(|(_, a)| !a.0.is_empty()).collect();
-            let questions: Vec<Query<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
-            LayerLooks::of(layer, expr, seen, count, &questions)
+            let queries: Vec<Query<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
+            LayerSamples::of(layer, expr, seen, count, &queries)
         };
         Self(scene.layers.iter().map(of).collect())
     }
@@ -96,34 +97,34 @@ impl Looks {
             let mut count = vec![0; layer.params.len()];
             ids.iter().for_each(|&i| count[i as usize] = 1);
             let places = vec![0; ids.len()];
-            LayerLooks::of(layer, expr, layer.spans(), count, &[(Time(t), &(ids, places))])
+            LayerSamples::of(layer, expr, layer.spans(), count, &[(Time(t), &(ids, places))])
         };
         Self(scene.layers.iter().map(of).collect())
     }
 }
 
-impl LayerLooks {
-    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, questions: &[Query<'_>]) -> Self {
-        let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { LOOKS * count.len() } else { 0 };
+impl LayerSamples {
+    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, queries: &[Query<'_>]) -> Self {
+        let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { SAMPLES * count.len() } else { 0 };
         let none = f32::NAN;
         let mut out = Self {
-            means: vec![[none; 3]; LOOKS * count.len()],
+            means: vec![[none; 3]; SAMPLES * count.len()],
             sizes: vec![none; wanted(&|e| matches!(e, Expr::Size(..)))],
             speeds: vec![none; wanted(&|e| matches!(e, Expr::Speed(..)))],
             colors: vec![[none; 3]; wanted(&|e| matches!(e, Expr::Color(..)))],
             count,
             seen,
         };
-        let asked: Vec<(Rows<'_>, Time)> = questions.iter().map(|(t, (ids, _))| (Rows::Some(ids), *t)).collect();
+        let asked: Vec<(Rows<'_>, Time)> = queries.iter().map(|(t, (ids, _))| (Rows::Some(ids), *t)).collect();
         let mut velocities = Table::default();
         sweep(layer, &asked, |i, tape| {
-            let (ids, places) = questions[i].1;
+            let (ids, places) = queries[i].1;
             let part = layer.part(tape);
             if !out.speeds.is_empty() {
-                layer.motion.velocity(&tape.question(&layer.params), &mut velocities);
+                layer.motion.velocity(&tape.query(&layer.params), &mut velocities);
             }
             for (j, (&id, &place)) in ids.iter().zip(places).enumerate() {
-                let at = LOOKS * id as usize + usize::from(place);
+                let at = SAMPLES * id as usize + usize::from(place);
                 out.means[at] = part.out.read::<3>(j, 0);
                 if !out.sizes.is_empty() {
                     out.sizes[at] = sym3::largest(part.out.read::<6>(j, COV).map(f64::from)).max(0.0).sqrt() as f32;
@@ -155,23 +156,23 @@ fn base_color(color: &Color<'_>, j: usize) -> [f32; 3] {
     }
 }
 
-/// All bits of so many looks.
+/// All bits of this many samples.
 fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }
 
-/// The rows whose features are like those of the Gaussian that is nearest to a place at any time that is examined.
+/// The rows whose features are like those of the Gaussian that is nearest to a position at any time that is examined.
 ///
 /// Errors: the scene has no features.
-fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Result<Selected> {
+fn alike(scene: &Scene<f32>, samples: &SceneSamples, place: [f64; 3], least: f64) -> Result<Selected> {
     let of = |layer: usize, row: usize| {
         let params = &scene.layers[layer].params;
         features::key(params).map(|key| features::row(params, key, row)).filter(|f| f.iter().any(|x| *x != 0.0))
     };
     let mut nearest: Option<(f64, Vec<f32>)> = None;
-    for (layer, l) in looks.0.iter().enumerate() {
+    for (layer, l) in samples.0.iter().enumerate() {
         for row in 0..l.count.len() {
-            let far = |i: u8| norm(sub(l.means[LOOKS * row + usize::from(i)].map(f64::from), place));
+            let far = |i: u8| norm(sub(l.means[SAMPLES * row + usize::from(i)].map(f64::from), place));
             let far = (0..l.count[row]).map(far).fold(f64::INFINITY, f64::min);
             if far < nearest.as_ref().map_or(f64::INFINITY, |n| n.0)
                 && let Some(features) = of(layer, row)
@@ -190,29 +191,29 @@ fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Resu
 }
 
 /// The rows for which a selection holds at most times.
-fn most(bits: &Bits, looks: &Looks) -> Selected {
-    let of = |(bits, looks): (&Vec<u8>, &LayerLooks)| {
-        bits.iter().zip(&looks.count).map(|(b, n)| 2 * (b & all(*n)).count_ones() > u32::from(*n)).collect()
+fn most(bits: &Bits, samples: &SceneSamples) -> Selected {
+    let of = |(bits, samples): (&Vec<u8>, &LayerSamples)| {
+        bits.iter().zip(&samples.count).map(|(b, n)| 2 * (b & all(*n)).count_ones() > u32::from(*n)).collect()
     };
-    bits.iter().zip(&looks.0).map(of).collect()
+    bits.iter().zip(&samples.0).map(of).collect()
 }
 
-fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Context) -> Result<Bits> {
-    let again = |e: &Expr| evaluate(e, scene, looks, context);
+fn evaluate(expr: &Expr, scene: &Scene<f32>, samples: &SceneSamples, context: &dyn Context) -> Result<Bits> {
+    let again = |e: &Expr| evaluate(e, scene, samples, context);
     // Of a row's numbers that do not change.
     let rows = |holds: &dyn Fn(usize, usize) -> bool| -> Bits {
-        let of = |(layer, looks): (usize, &LayerLooks)| {
-            (0..looks.count.len()).map(|row| if holds(layer, row) { all(looks.count[row]) } else { 0 }).collect()
+        let of = |(layer, samples): (usize, &LayerSamples)| {
+            (0..samples.count.len()).map(|row| if holds(layer, row) { all(samples.count[row]) } else { 0 }).collect()
         };
-        looks.0.iter().enumerate().map(of).collect()
+        samples.0.iter().enumerate().map(of).collect()
     };
     let chosen = |selected: &Selected| rows(&|layer, row| selected[layer][row]);
-    let moments = |holds: &dyn Fn(&LayerLooks, usize) -> bool| -> Bits {
-        let bit = |looks: &LayerLooks, row: usize| {
-            let one = |i: &u8| holds(looks, LOOKS * row + usize::from(*i));
-            (0..looks.count[row]).filter(one).map(|i| 1 << i).sum()
+    let moments = |holds: &dyn Fn(&LayerSamples, usize) -> bool| -> Bits {
+        let bit = |samples: &LayerSamples, row: usize| {
+            let one = |i: &u8| holds(samples, SAMPLES * row + usize::from(*i));
+            (0..samples.count[row]).filter(one).map(|i| 1 << i).sum()
         };
-        looks.0.iter().map(|l| (0..l.count.len()).map(|row| bit(l, row)).collect()).collect()
+        samples.0.iter().map(|l| (0..l.count.len()).map(|row| bit(l, row)).collect()).collect()
     };
     let places = |holds: &dyn Fn([f64; 3]) -> bool| moments(&|l, i| holds(l.means[i].map(f64::from)));
     let pair = |a: &Expr, b: &Expr, of: &dyn Fn(u8, u8) -> u8| -> Result<Bits> {
@@ -249,7 +250,7 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
             (*from..=*to).contains(&scene.layers[layer].params[GEOMETRY].get(row, OPACITY).sigmoid().f64())
         }),
         Expr::Life(from, to) => rows(&|layer, row| {
-            let [first, last] = looks.0[layer].seen[row];
+            let [first, last] = samples.0[layer].seen[row];
             (*from..=*to).contains(&(last - first).max(0.0))
         }),
         Expr::Layer(name) => {
@@ -266,13 +267,13 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
             let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
             rows(&|layer, row| of[layer][row] == wanted)
         }
-        Expr::Like(place, least) => chosen(&alike(scene, looks, *place, *least)?),
+        Expr::Like(place, least) => chosen(&alike(scene, samples, *place, *least)?),
         Expr::At(t, inner) => {
             if !(scene.clip[0]..=scene.clip[1]).contains(t) {
                 return Err(Error::input(format!("{t} s is not in the scene's clip"))
                     .remedy(format!("It goes from {} to {} s", scene.clip[0], scene.clip[1])));
             }
-            let then = Looks::at(scene, inner, *t);
+            let then = SceneSamples::at(scene, inner, *t);
             let bits = evaluate(inner, scene, &then, context)?;
             chosen(&most(&bits, &then))
         }
@@ -282,10 +283,10 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
         }
         Expr::Always(inner) => {
             let bits = again(inner)?;
-            rows(&|layer, row| bits[layer][row] == all(looks.0[layer].count[row]) && bits[layer][row] != 0)
+            rows(&|layer, row| bits[layer][row] == all(samples.0[layer].count[row]) && bits[layer][row] != 0)
         }
         Expr::Grow(inner, distance) => {
-            let inner = most(&again(inner)?, looks);
+            let inner = most(&again(inner)?, samples);
             chosen(&grown(scene, inner, *distance))
         }
         Expr::And(a, b) => pair(a, b, &|a, b| a & b)?,
@@ -293,8 +294,8 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
         Expr::Not(inner) => {
             let bits = again(inner)?;
             let of =
-                |(bits, l): (&Vec<u8>, &LayerLooks)| bits.iter().zip(&l.count).map(|(b, n)| !b & all(*n)).collect();
-            bits.iter().zip(&looks.0).map(of).collect()
+                |(bits, l): (&Vec<u8>, &LayerSamples)| bits.iter().zip(&l.count).map(|(b, n)| !b & all(*n)).collect();
+            bits.iter().zip(&samples.0).map(of).collect()
         }
     })
 }

@@ -29,7 +29,7 @@ pub(crate) const VERSION: u32 = 1;
 /// Most steps: a bound for files.
 const MOST_STEPS: usize = 10_000;
 
-/// A list of steps, as `edits.toml` has it.
+/// A list of steps, as in `edits.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Edits {
@@ -50,7 +50,7 @@ impl Default for Edits {
 }
 
 impl Edits {
-    /// Refuses lists that this version does not know, and those for another scene.
+    /// Refuses lists of unsupported versions and those for another scene.
     pub fn check(&self, title: &str) -> Result<()> {
         if self.version != VERSION {
             let what = format!("the edits have version {}, this splat4d supports {VERSION}", self.version);
@@ -79,11 +79,11 @@ pub struct Place {
     pub turn: Option<[f64; 4]>,
     /// How many times as large.
     pub scale: Option<f64>,
-    /// The fixed point of turning and scaling, scene units; the origin unless said.
+    /// The fixed point of turning and scaling, scene units; the origin unless stated.
     pub about: Option<[f64; 3]>,
 }
 
-/// A place at a time.
+/// A position at a time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlaceKey {
@@ -95,7 +95,7 @@ pub struct PlaceKey {
     pub turn: Option<[f64; 4]>,
     /// How many times as large.
     pub scale: Option<f64>,
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
@@ -105,14 +105,14 @@ pub struct PlaceKey {
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 #[non_exhaustive]
 pub enum Step {
-    /// They are gone.
+    /// Deletes them.
     Delete {
         /// What.
         select: String,
     },
-    /// All others are gone.
+    /// Deletes all others.
     Crop {
-        /// What stays.
+        /// The selection to keep.
         select: String,
     },
     /// They are not seen for from ≤ t < to.
@@ -128,13 +128,13 @@ pub enum Step {
     Recolor {
         /// What.
         select: String,
-        /// Stops: 1 is twice as bright.
+        /// Stops: 1 doubles the brightness.
         #[serde(default)]
         exposure: f64,
         /// Factors of red, green and blue.
         #[serde(default)]
         tint: Option<[f64; 3]>,
-        /// 0 is grey, 1 as it is.
+        /// 0 is grey, 1 changes nothing.
         #[serde(default)]
         saturation: Option<f64>,
         /// Corners [in, out] of a broken line, 0 to 1; none: no curve.
@@ -152,11 +152,11 @@ pub enum Step {
         #[serde(default)]
         keys: Vec<FadeKey>,
     },
-    /// Elsewhere, turned, larger: for good, or by keys over time.
+    /// Elsewhere, turned, larger: at all times, or by keys over time.
     Move {
         /// What.
         select: String,
-        /// Where to, at all times.
+        /// The transform, at all times.
         #[serde(default)]
         to: Option<Place>,
         /// Or at key times.
@@ -180,21 +180,21 @@ pub enum Step {
         /// Its name.
         name: String,
     },
-    /// The clip is from to to; what is seen outside of it alone is gone.
+    /// The clip becomes from..to; Gaussians visible only outside of it are deleted.
     Cut {
         /// Seconds.
         from: f64,
         /// Seconds.
         to: f64,
     },
-    /// A part of the clip runs `rate` times as fast, backwards below zero; what follows comes earlier or later.
+    /// A part of the clip runs `rate` times as fast, backwards below zero; the rest is shifted in time.
     Retime {
         /// Factor of speed, not zero.
         rate: f64,
-        /// Seconds; the clip's start unless said.
+        /// Seconds; the clip's start unless stated.
         #[serde(default)]
         from: Option<f64>,
-        /// Seconds; the clip's end unless said.
+        /// Seconds; the clip's end unless stated.
         #[serde(default)]
         to: Option<f64>,
     },
@@ -204,23 +204,23 @@ pub enum Step {
         scene: String,
         /// Its layers' names begin with this and a slash.
         name: String,
-        /// The second at which its clip starts here; that of its own clock unless said.
+        /// The second at which its clip starts here; that of its own clock unless stated.
         #[serde(default)]
         at: Option<f64>,
-        /// Where it stands.
+        /// Its placement.
         #[serde(default)]
         to: Place,
     },
     /// Control nodes are pulled by handles over time; everything between follows as rigidly as possible.
     Drag {
-        /// What is bent.
+        /// The selection to deform.
         select: String,
-        /// Second at which the places below are meant.
+        /// Second at which the positions below are meant.
         at: f64,
         /// Nodes; 0: those that the model has.
         #[serde(default = "drag::usual_nodes")]
         nodes: usize,
-        /// What is pulled, and where to.
+        /// The pulled points and their targets.
         handles: Vec<DragHandle>,
         /// Spheres [x, y, z, radius] whose nodes stay.
         #[serde(default)]
@@ -281,7 +281,7 @@ pub struct Mask {
     pub white: Vec<bool>,
 }
 
-/// What edits name and a scene does not hold. The methods of the trait itself have nothing: they are errors that say so.
+/// Data that edits name and a scene does not contain. The methods of the trait itself have nothing: they return errors.
 pub trait Context {
     /// The camera of that name.
     fn camera(&self, name: &str) -> Result<Camera> {
@@ -293,7 +293,7 @@ pub trait Context {
         Err(missing(&format!("mask `{name}`"), "Give a file that can be read"))
     }
 
-    /// The subject as masks of a capture have it: by camera and time.
+    /// The subject from the masks of a capture: by camera and time.
     fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {
         Err(missing("subject", "Give the run of a capture with masks"))
     }
@@ -313,7 +313,8 @@ pub trait Context {
         Err(missing("training view", "Give the run folder of a capture that is still there"))
     }
 
-    /// Where nodes that are at `start` at `times[first]` are at all `times`, `[times][nodes]`: carried by the Gaussians `among`.
+    /// Positions at all `times` of nodes that are at `start` at `times[first]`, `[times][nodes]`: carried by the
+    /// Gaussians `among`.
     fn follow(
         &self,
         scene: &Scene<f32>,
@@ -328,7 +329,7 @@ fn missing(what: &str, remedy: &str) -> Error {
     Error::input(format!("there is no {what}")).remedy(remedy.to_owned())
 }
 
-/// What a step did.
+/// Effect of a step.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Done {
     /// The step's name.
@@ -339,10 +340,11 @@ pub struct Done {
     pub gaussians: usize,
 }
 
-/// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep theirs.
+/// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep
+/// theirs.
 ///
-/// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are not,
-/// numbers out of range, numbers that overflow, more Gaussians than memory holds, what a pixel head cannot show.
+/// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are
+/// not, numbers out of range, numbers that overflow, more Gaussians than memory holds, what a pixel head cannot show.
 pub fn replay(
     steps: &[Step],
     scene: Scene<f32>,
@@ -352,7 +354,7 @@ pub fn replay(
     replay_after(Vec::new(), steps, scene, context, progress)
 }
 
-/// The same, on a scene on which others were run before; what those did comes back in front.
+/// The same, on a scene on which others were run before; their steps are listed first.
 ///
 /// Errors: as [`replay`].
 pub fn replay_after(

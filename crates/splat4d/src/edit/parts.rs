@@ -43,8 +43,8 @@ pub(super) fn each_part(
     scene.layers = layers;
 }
 
-/// Puts a change around the models of the selected Gaussians, which get layers of their own. Changes are in the world: a
-/// frame goes inside first.
+/// Puts a change around the models of the selected Gaussians, which get layers of their own. Changes are in the world:
+/// a frame is applied first.
 pub(super) fn wrap(scene: &mut Scene<f32>, selected: &Selected, change: &dyn Fn(usize) -> Change) -> Result<()> {
     each_part(scene, selected, None, &|layer| vec![layer.clone()]);
     for (from, index) in parts(selected) {
@@ -55,7 +55,7 @@ pub(super) fn wrap(scene: &mut Scene<f32>, selected: &Selected, change: &dyn Fn(
     Ok(())
 }
 
-/// After [`each_part`] kept every part: (number of the layer before, place of its part now).
+/// After [`each_part`] kept every part: (number of the layer before, position of its part now).
 pub(super) fn parts(selected: &Selected) -> Vec<(usize, usize)> {
     let (mut out, mut at) = (Vec::new(), 0);
     for (from, selected) in selected.iter().enumerate() {

@@ -1,7 +1,7 @@
-//! Selections: what an edit is about, in words that hold for any scene.
+//! Selections: the Gaussians of an edit, described by text that is valid for any scene.
 //!
-//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lives, never row numbers, so that a
-//! selection finds the same thing again after the scene was trained again. See docs/edit.md for the list.
+//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of positions, appearance and lifespans, never row
+//! numbers, so that a selection finds the same object after the scene was trained again. See docs/edit.md for the list.
 
 use crate::math::quat;
 use crate::math::se3::{mat_vec, sub, transpose};
@@ -25,7 +25,7 @@ pub enum Expr {
     Box([f64; 3], [f64; 3]),
     /// Centre and radius, scene units.
     Sphere([f64; 3], f64),
-    /// In the image of a camera, and farther than and nearer than so many scene units.
+    /// In the image of a camera, and farther than and nearer than this many scene units.
     Frustum(String, [f64; 2]),
     /// Base colour within a distance of one, 0 to 1.
     Color([f64; 3], f64),
@@ -35,7 +35,7 @@ pub enum Expr {
     Size(f64, f64),
     /// Seconds of the clip in which it can be seen.
     Life(f64, f64),
-    /// Scene units a second.
+    /// Scene units per second.
     Speed(f64, f64),
     /// Name of a layer.
     Layer(String),
@@ -45,17 +45,17 @@ pub enum Expr {
     Visible(Box<Surface>),
     /// Name of a label.
     Label(String),
-    /// Features like those of the Gaussian nearest to a place, scene units: the least cosine between them.
+    /// Features like those of the Gaussian nearest to a position, scene units: the least cosine between them.
     Like([f64; 3], f64),
     /// On the white of a mask image, seen by a camera.
     Mask(String, String),
-    /// On the subject, as the capture's masks have it.
+    /// On the subject of the capture's masks.
     Subject,
-    /// What holds at that second.
+    /// The inner selection at that second.
     At(f64, Box<Expr>),
-    /// What holds at any time of a Gaussian's life.
+    /// The inner selection at any time of a Gaussian's lifespan.
     Ever(Box<Expr>),
-    /// What holds at all of them.
+    /// The inner selection at all of them.
     Always(Box<Expr>),
     /// These and all within a distance of one of them, scene units.
     Grow(Box<Expr>, f64),
@@ -67,10 +67,10 @@ pub enum Expr {
     Not(Box<Expr>),
 }
 
-/// A polygon on an image, and how far behind it is looked.
+/// A polygon on an image, and the depth behind it that counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lasso {
-    /// Where the image was seen from, scene units.
+    /// Position of the image's camera, scene units.
     pub eye: [f64; 3],
     /// World from camera, wxyz of any length but zero; camera axes are OpenCV's.
     pub turn: [f64; 4],
@@ -156,7 +156,7 @@ impl Expr {
         }
     }
 
-    /// Reads a selection. Errors: the first place that cannot be read, and what may stand there.
+    /// Reads a selection. Errors: the first position that cannot be read, and what may be there.
     pub fn parse(text: &str) -> Result<Self> {
         let mut parser = Parser { text, tokens: tokens(text)?, at: 0, depth: 0 };
         let expr = parser.either()?;
@@ -181,7 +181,7 @@ impl Expr {
 enum Token {
     Word(String),
     Text(String),
-    /// Its value, and as it is written: a camera may be called 00.
+    /// Its value and its text: a camera may be called 00.
     Number(f64, String),
     Open,
     Close,
@@ -311,8 +311,8 @@ impl Parser<'_> {
                 self.at += 1;
                 self.named(&word)
             }
-            Some(other) => Err(self.wrong(&format!("`{other}` stands where a predicate should"))),
-            None => Err(self.wrong("it ends where a predicate should stand")),
+            Some(other) => Err(self.wrong(&format!("expected a predicate, found `{other}`"))),
+            None => Err(self.wrong("expected a predicate, found the end")),
         }
     }
 

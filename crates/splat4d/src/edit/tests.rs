@@ -137,7 +137,7 @@ fn counted(text: &str, scene: &Scene<f32>) -> usize {
     count(&Expr::parse(text).unwrap(), scene, &[], &Bench::empty()).unwrap().0
 }
 
-/// One Gaussian that goes from x = −1 at 0 s to x = 1 at 1 s, and one that stands at x = 2.
+/// One Gaussian that goes from x = −1 at 0 s to x = 1 at 1 s, and one that is at x = 2.
 fn walker() -> Scene<f32> {
     let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: false, detach: true, origin: 0.5, features: None });
     let mut params = Params::new(2, 1, &[]);
@@ -235,7 +235,7 @@ fn labels_are_selected_kept_and_merged() {
 }
 
 #[test]
-fn a_mask_selects_what_its_camera_sees() {
+fn a_mask_selects_gaussians_visible_to_its_camera() {
     let s = walker();
     // The left half of the image is white: x < 0 of the camera, which sees the world mirrored in no axis.
     let white = (0..48 * 64).map(|i| i % 64 < 32).collect::<Vec<_>>();
@@ -345,7 +345,7 @@ fn keys_move_over_time() {
         assert!(psnr(&draw(&moved, 0.1), &draw(&s, 0.1)) > 90.0);
         assert!(psnr(&draw(&moved, 0.5), &draw(&at("[0.3, 0, 0]", 30.0), 0.5)) > 60.0);
         assert!(psnr(&draw(&moved, 0.9), &draw(&at("[0.6, 0, 0]", 60.0), 0.9)) > 60.0);
-        // A single key holds at all times, and a time taken out has it.
+        // A single key holds at all times, and a removed time range has it.
         let one = run(r#"[{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0.3, 0, 0]}]}]"#, &s).unwrap();
         let frozen = crate::layers::moment(&one, Time(0.4)).unwrap();
         let still = Layer::new("now", frozen, std::sync::Arc::new(crate::motion::Still), LifeKind::Infinite);
@@ -734,7 +734,7 @@ fn an_overflow_is_refused_and_names_its_step() {
         for scene in scenes() {
             let text = format!("[{hide}, {step}]");
             let error = match run(&text, &scene) {
-                // What does not overflow is no NaN either.
+                // Values that do not overflow are not NaN either.
                 Ok(edited) => {
                     let written = write(&edited, &mut Vec::new());
                     assert!(written.is_ok(), "{step}: {written:?}");

@@ -1,11 +1,11 @@
-//! Points that are asked for and followed: a pixel of an image, or a place in the world, through all times, with what a
-//! camera sees of it.
+//! Points that are requested and followed: a pixel of an image, or a position in the world, through all times, with
+//! what a camera sees of it.
 //!
-//! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which half of
-//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point is on
-//! the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on by their mean
-//! displacement; where half of them have died, the nearest that live on take over, so that points are followed through
-//! models with short lifespans, at the price of the drift of an integration.
+//! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which
+//! half of the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its
+//! point is on the pixel's ray at that depth. A position belongs to the Gaussians nearest to it. They carry the point
+//! on by their mean displacement; where half of them have died, the nearest ones that are still alive take over, so
+//! that points are followed through models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};
@@ -15,7 +15,7 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Rows, Time};
 use rayon::prelude::*;
 
-/// Gaussians of a pixel, and those that carry a place: one alone may be a floater.
+/// Gaussians of a pixel, and those that carry a position: one alone may be a floater.
 const HEAVIEST: usize = 8;
 const NEAREST: usize = 4;
 /// Fainter Gaussians are not taken for a surface.
@@ -24,28 +24,28 @@ const LEAST_OPACITY: f64 = 0.5;
 const ONE_SURFACE: f64 = 0.05;
 /// A pixel that shows less than this shows nothing; a point before which more than this is left is seen.
 const HALF: f64 = 0.5;
-/// Standard deviations of the nearest Gaussian (all three axes together) within which it carries a place.
+/// Standard deviations of the nearest Gaussian (all three axes together) within which it carries a position.
 const REACH: f64 = 4.0;
 
-/// Where a point is at the time of its query.
+/// Position of a point at the time of its query.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Place {
     /// There, scene units.
     World([f64; 3]),
-    /// What this pixel position shows.
+    /// The surface at this pixel position.
     Pixel(Box<Camera>, [f64; 2]),
 }
 
 /// A point to follow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Query {
-    /// When it is where it is asked for, seconds.
+    /// When it is where it is requested, seconds.
     pub time: f64,
     /// Where.
     pub place: Place,
 }
 
-/// Where points are at some times.
+/// Positions of points at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Followed {
     /// Seconds.
@@ -57,13 +57,13 @@ pub struct Followed {
 }
 
 impl Followed {
-    /// One query's places, a time each.
+    /// One query's positions, a time each.
     pub fn path(&self, query: usize) -> &[Option<[f64; 3]>] {
         &self.points[query * self.times.len()..(query + 1) * self.times.len()]
     }
 }
 
-/// A camera's sight of a point.
+/// A camera's view of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PointView {
     /// Pixel position; outside of the image too.
@@ -98,7 +98,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
         let (mut now, mut next) = (ActiveGaussians::default(), ActiveGaussians::default());
         for (step, &k) in order.iter().enumerate() {
             if step == 0 {
-                now.look(scene, moments[k]);
+                now.evaluate(scene, moments[k]);
             }
             for (q, start) in begin(scene, &now, queries, &begins, k) {
                 out.starts[q] = start.as_ref().map(|p| p.at);
@@ -112,7 +112,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
                 }
             }
             let Some(&to) = order.get(step + 1) else { break };
-            next.look(scene, moments[to]);
+            next.evaluate(scene, moments[to]);
             on_the_way.par_iter_mut().for_each(|point| {
                 if let Some(p) = point
                     && !p.step(&now, &next)
@@ -126,10 +126,10 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
     out
 }
 
-/// What a camera sees of points at one time.
+/// Points seen by a camera at one time.
 pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f64; 3]>]) -> Vec<Option<PointView>> {
     let mut seen = ActiveGaussians::default();
-    seen.look(scene, t.0);
+    seen.evaluate(scene, t.0);
     let projected = projected(scene, &seen, camera);
     let sight = |point: &Option<[f64; 3]>| {
         let (pixel, z) = camera.project((*point)?)?;
@@ -259,7 +259,7 @@ impl Point {
         self.at.iter().all(|x| x.is_finite())
     }
 
-    /// The mean displacement of the carriers that live at both times; `None`: fewer than half of them do.
+    /// The mean displacement of the carriers that are alive at both times; `None`: fewer than half of them do.
     fn moved(&self, now: &ActiveGaussians, next: &ActiveGaussians) -> Option<[f64; 3]> {
         let (mut sum, mut all) = ([0.0; 3], 0.0);
         for &(member, weight) in &self.carriers {
@@ -279,7 +279,7 @@ struct ActiveGaussians {
 }
 
 impl ActiveGaussians {
-    fn look(&mut self, scene: &Scene<f32>, t: f64) {
+    fn evaluate(&mut self, scene: &Scene<f32>, t: f64) {
         scene.at(Time(t), &mut self.evaluation);
     }
 
@@ -294,7 +294,7 @@ impl ActiveGaussians {
         unreachable!("splats are those of the tapes")
     }
 
-    /// Where a Gaussian is; `None`: it is not alive.
+    /// Position of a Gaussian; `None`: it is not alive.
     fn mean(&self, member: Member) -> Option<[f64; 3]> {
         let tape = self.evaluation.tape(member.layer);
         let j = match tape.rows() {
@@ -304,8 +304,8 @@ impl ActiveGaussians {
         Some(tape.out().read::<3>(j, 0).map(f64::from)).filter(|x| x.iter().all(|x| x.is_finite()))
     }
 
-    /// The Gaussians that carry what is at x, alike; of those that live on at `next` where it is given. None where the
-    /// nearest is too far to be of one thing with it.
+    /// The Gaussians that carry the point at x, with equal weights; only those alive at `next` if it is given. None
+    /// where the nearest is too far away to belong to it.
     fn around(&self, x: [f64; 3], next: Option<&ActiveGaussians>) -> Vec<(Member, f64)> {
         let mut best: Vec<(f64, f64, Member)> = Vec::with_capacity(NEAREST + 1);
         for (layer, tape) in self.evaluation.tapes().enumerate() {
@@ -343,7 +343,8 @@ mod tests {
     use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
     use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
 
-    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every place a chain of Gaussians of `life` seconds.
+    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every position a chain of Gaussians of `life`
+    /// seconds.
     fn wall(z: f64, wide: f64, velocity: [f64; 3], life: Option<f64>) -> Layer<f32> {
         const SIDE: usize = 24;
         let births: Vec<f64> = life.map_or(vec![0.5], |l| (0..=(1.0 / l) as usize).map(|i| i as f64 * l).collect());
@@ -356,7 +357,7 @@ mod tests {
             for i in 0..SIDE * SIDE {
                 let r = b * SIDE * SIDE + i;
                 let at = |k: usize| (k as f64 / (SIDE - 1) as f64 - 0.5) * wide;
-                // A Gaussian that lives around its birth is then where the wall is then.
+                // A Gaussian alive around its birth is at the wall's position then.
                 let x = [at(i % SIDE), at(i / SIDE), z];
                 let x: [f64; 3] = std::array::from_fn(|k| x[k] + velocity[k] * (birth - 0.5));
                 p[GEOMETRY].write(r, 0, x.map(|x| x as f32));
@@ -409,13 +410,13 @@ mod tests {
             let x = x.expect("somebody carries it on");
             assert!(norm(sub(x, [0.1 + 0.4 * t, 0.2, 0.0])) < 1e-4, "{t}: {x:?}");
         }
-        // None of those that begin live to the end.
+        // None of the first ones is alive at the end.
         assert!(s.layers[0].spans().iter().all(|[from, to]| *from > 0.0 || *to < 1.0));
     }
 
     #[test]
     fn occluded_points_are_marked_and_empty_pixels_not_followed() {
-        // A small screen before a wall goes from left to right.
+        // A small screen before a wall moves from left to right.
         let s = scene(vec![wall(0.0, 6.0, [0.0; 3], None), wall(1.0, 0.6, [2.0, 0.0, 0.0], None)]);
         let seen = |t: f64, x: [f64; 3]| sights(&s, &camera(), Time(t), &[Some(x)])[0].unwrap();
         assert!(seen(0.0, [0.0; 3]).visible && !seen(0.5, [0.0; 3]).visible && seen(1.0, [0.0; 3]).visible);

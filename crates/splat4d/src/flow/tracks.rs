@@ -17,7 +17,7 @@ pub struct Member {
     pub row: u32,
 }
 
-/// Where some Gaussians are at some times.
+/// Positions of some Gaussians at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Tracks {
     /// Seconds.
@@ -62,7 +62,8 @@ impl Tracks {
         &self.points[member * self.times.len()..(member + 1) * self.times.len()]
     }
 
-    /// With `offset` added in f64. As JSON: `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
+    /// With `offset` added in f64. As JSON:
+    /// `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
     pub fn to_json<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
         let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", self.times);
         for (i, m) in self.members.iter().enumerate() {
@@ -177,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_are_followed_while_they_live() {
+    fn gaussians_are_followed_during_their_lifespans() {
         let s = scene();
         let tracks = Tracks::follow(&s, &every(&s, 2), &[0.0, 1.0]);
         assert_eq!(tracks.members.iter().map(|m| m.row).collect::<Vec<_>>(), [0, 2, 4]);
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_are_the_nearest_of_the_living() {
+    fn the_nearest_are_chosen_among_active_gaussians() {
         let s = scene();
         let rows = |t: f64, count| -> Vec<u32> {
             nearest(&s, Time(t), &[[3.7, 0.0, 0.0]], count, 0.1)[0].iter().map(|m| m.row).collect()

@@ -50,7 +50,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// f32 number `i` of little-endian bytes that are known to hold it.
+/// f32 number `i` of little-endian bytes that contain it.
 #[inline]
 pub(super) fn f32_at(bytes: &[u8], i: usize) -> f32 {
     f32::from_le_bytes(*bytes[4 * i..].first_chunk().expect("the row holds this number"))
@@ -69,7 +69,7 @@ pub(super) fn scale_of_log(log: f32) -> f32 {
     log.exp().min(f32::MAX)
 }
 
-/// The logit of an opacity of `byte`/255. The ends stand for half an interval, whose middle is taken: their own logits
+/// The logit of an opacity of `byte`/255. The ends represent half an interval, whose middle is taken: their own logits
 /// are infinite.
 #[inline]
 pub(super) fn logit_of_byte(byte: u8) -> f32 {
@@ -95,8 +95,8 @@ pub(super) fn dc_of_byte(byte: u8) -> f32 {
     (f32::from(byte) / 255.0 - 0.5) / SH_C0
 }
 
-/// Rows without NaN or infinity in geometry, colour and life: one such number would spoil a whole block of a quantised
-/// file. Says how many were left out.
+/// Rows without NaN or infinity in geometry, colour and lifespan: one such number would spoil a whole block of a
+/// quantised file. Returns how many were left out.
 pub(super) fn sound_rows(params: &Params, warnings: &mut Warnings) -> Vec<usize> {
     let finite = |row: usize| {
         [GEOMETRY, SH, LIFE].into_iter().all(|key| {

@@ -41,7 +41,7 @@ fn read(bytes: &[u8]) -> Result<Opened> {
     {
         let file = Tensors { torch: &torch, dict: pipeline, prefix: SPLATFACTO };
         let params = file.gaussians(["features_dc", "features_rest"])?;
-        warnings.say("the model is in the world of nerfstudio (z up), which its data parser scaled and centred");
+        warnings.add("the model is in the world of nerfstudio (z up), which its data parser scaled and centred");
         return Ok(Opened { up: Some(NERFSTUDIO_UP), ..Opened::from((params, warnings)) });
     }
     let splats = [torch.get(root, "splats"), Some(root)].into_iter().flatten();
@@ -186,7 +186,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn freetime_gaussians_move_and_live() {
+    fn freetime_gaussians_have_velocities_and_lifespans() {
         let p = gaussians(3, 4);
         let mut all = tensors(&p, ["sh0", "shN"], "");
         all.push(("times".into(), vec![3, 1], vec![0.5, 0.0, 1.0]));

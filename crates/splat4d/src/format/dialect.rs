@@ -29,7 +29,7 @@ pub struct Dialect {
     pub name: &'static str,
     /// How names of its files end, in lower case, dot included. It may end with another one's: the longer one counts.
     pub ending: &'static str,
-    /// The direction that its world calls up, by custom, where the file does not say it.
+    /// The conventional up direction where the file does not state it.
     pub up: [f64; 3],
     /// Whether it holds a moving scene.
     pub moves: bool,
@@ -43,7 +43,7 @@ pub struct Dialect {
     pub world: bool,
 }
 
-/// How a dialect is written. Writers say what was left out.
+/// How a dialect is written. Writers report what was left out.
 #[derive(Clone, Copy)]
 pub enum Writer {
     /// One time.
@@ -61,9 +61,9 @@ pub struct WriteOptions {
     pub spz_version: u32,
     /// Views that a player may offer, in the axes of the scene.
     pub cameras: Vec<Camera>,
-    /// Refuse Gaussians whose fade in time the dialect cannot say exactly, in place of fitting one.
+    /// Refuse Gaussians whose fade in time the dialect cannot express exactly, instead of fitting one.
     pub exact: bool,
-    /// Which way is up, for dialects whose files say so; `Dialect::write` takes it from the scene.
+    /// Which way is up, for dialects whose files specify it; `Dialect::write` takes it from the scene.
     pub up: [f64; 3],
     /// The scene's offset; `Dialect::write` sets it.
     pub offset: [f64; 3],
@@ -84,17 +84,18 @@ pub struct PlyInfo {
     pub gaussians: usize,
     /// Degree of the spherical harmonics, 0-3.
     pub sh_degree: usize,
-    /// Rows that hold a NaN or an infinity without a meaning; they are kept as they are.
+    /// Rows that hold a NaN or an infinity without a meaning; they are kept.
     pub non_finite_rows: usize,
     /// Infinities that mean something, now finite.
     pub mended: Mended,
     /// Whether base colours are RGB (`red green blue`), not coefficients.
     pub rgb: bool,
-    /// What was subtracted from positions in double precision that are far from the origin, or what the file states was.
+    /// The offset subtracted from positions in double precision that are far from the origin, or stated by the file
+    /// was.
     pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
-    /// What was assumed or is not read, in sentences without a full stop.
+    /// Assumptions and unread content, in sentences without a full stop.
     pub assumed: Vec<String>,
     /// The header's comments.
     pub comments: Vec<String>,
@@ -105,7 +106,7 @@ pub struct PlyInfo {
 /// An opened file.
 #[derive(Debug)]
 pub struct Opened {
-    /// The scene, in the file's own axes; `up` states which way they lie.
+    /// The scene, in the file's own axes; `up` states their orientation.
     pub scene: Scene<f32>,
     /// Which way is up, where the file itself states so.
     pub up: Option<[f64; 3]>,
@@ -127,24 +128,24 @@ impl From<(Params, Warnings)> for Opened {
     }
 }
 
-/// A scene of one layer that is static; its `up` is not said.
+/// A scene of one layer that is static; its `up` is not set.
 pub fn still(params: Params) -> Scene<f32> {
     let layer = Layer::new("gaussians", params, Arc::new(Still), LifeKind::Infinite);
     Scene { layers: vec![layer], fps: DEFAULT_FPS, ..Scene::default() }
 }
 
 impl Dialect {
-    /// What a file is by its content. `None`: none of these, or of one without a mark.
+    /// The kind of a file by its content. `None`: none of these, or of one without a mark.
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
         DIALECTS.iter().rev().find(|d| d.mark.is_some_and(|mark| mark(bytes))).copied()
     }
 
-    /// What a file is by its content; by the ending of its name where the content does not decide.
+    /// The kind of a file by its content; by the ending of its name where the content does not decide.
     pub fn of_file(name: &str, bytes: &[u8]) -> Option<Self> {
         Self::of(bytes).or_else(|| Self::by_ending(name).filter(|d| d.mark.is_none()))
     }
 
-    /// What a file with this name should be.
+    /// The kind of a file by its name.
     pub fn by_ending(name: &str) -> Option<Self> {
         let name = name.to_ascii_lowercase();
         DIALECTS.iter().filter(|d| name.ends_with(d.ending)).max_by_key(|d| d.ending.len()).copied()
@@ -160,16 +161,16 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files that are
-    /// read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
+    /// The part of [`open`](Self::open) after reading: sets the up direction and repairs values at the edge. For files
+    /// that are read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
     pub fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);
         let (of, mut mended) = (opened.scene.len(), opened.ply.as_ref().map(|p| p.mended).unwrap_or_default());
         for layer in &mut opened.scene.layers {
             mended += Mended::of(&mut layer.params);
-            mend::say_coarse(&layer.params, &mut opened.warnings);
+            mend::warn_coarse(&layer.params, &mut opened.warnings);
         }
-        mended.say(of, &mut opened.warnings);
+        mended.report(of, &mut opened.warnings);
         opened
     }
 
@@ -184,10 +185,11 @@ impl Dialect {
         Err(Error::new(ErrorKind::Unsupported, format!("{} is read, but not written", self.name)).remedy(remedy))
     }
 
-    /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
-    /// first time. Says what was left out.
+    /// Writes a scene, whose axes are not changed; a dialect without motion gets the clip's first time. Returns what
+    /// was left out.
     ///
-    /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the sink's.
+    /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the
+    /// sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
         scene.check_finite()?;
         let options = WriteOptions { up: scene.up, offset: scene.offset, ..options.clone() };
@@ -287,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn no_dialect_writes_what_is_not_finite() {
+    fn no_dialect_writes_numbers_that_are_not_finite() {
         for dialect in DIALECTS.iter().filter(|d| d.is_written()) {
             for bad in [f32::NAN, f32::INFINITY] {
                 let (mut scene, mut bytes) = (sample(dialect.moves), Vec::new());

@@ -84,7 +84,7 @@ fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
         (1..frames).any(|f| (0..3).any(|k| (colors[3 * (f * rows + row) + k] - colors[3 * row + k]).abs() > VISIBLE))
     };
     warnings.counted((0..rows).filter(changes).count(), rows, "change their colour: that of the first frame is read");
-    warnings.say(format!("the file states no frame rate: {DEFAULT_FPS} frames per second are assumed"));
+    warnings.add(format!("the file states no frame rate: {DEFAULT_FPS} frames per second are assumed"));
     let times: Vec<f64> = (0..frames).map(|i| i as f64 / DEFAULT_FPS).collect();
     let clip = [0.0, times[frames - 1]];
     let motion = Tracked::new(&TrackedSpec { times, foreground: false }, &mut params)?;
@@ -136,7 +136,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn gaussians_are_where_each_frame_has_them() {
+    fn gaussians_have_the_positions_of_each_frame() {
         let opened = DIALECT.open(&sample()).unwrap();
         assert_eq!((opened.scene.len(), opened.scene.clip[1]), (2, 2.0 / DEFAULT_FPS));
         let said = opened.warnings.lines().join("\n");

@@ -1,9 +1,9 @@
-//! Smooth fades for Gaussians whose opacity has a flat top in time or ends at once: what playback files hold, and the moving
-//! dialects of other programs cannot say.
+//! Smooth fades for Gaussians whose opacity has a flat top in time or ends at once: what playback files hold, and the
+//! moving dialects of other programs cannot express.
 //!
-//! A Gaussian's opacity over time becomes A·exp(−((t − centre)/width)²), least squares over the clip. One that is cut off
-//! within the clip, because its path goes on as another Gaussian, fades over half its length to either side of the cut, so
-//! that the two give way to each other; the fading is that of layers (1 − (1 − o)^w).
+//! A Gaussian's opacity over time becomes A·exp(−((t − centre)/width)²), least squares over the clip. One that is cut
+//! off within the clip, because its path continues as another Gaussian, fades over half its length to either side of
+//! the cut, so that the two give way to each other; the fading is that of layers (1 − (1 − o)^w).
 
 use crate::scene::LifeKind;
 use crate::scene::Time;
@@ -29,11 +29,11 @@ pub(super) struct Visibility {
     pub(super) kind: LifeKind,
     /// Its columns, as [`LifeKind::eval`] takes them.
     pub(super) life: [f64; 3],
-    /// Opacity at the life's top.
+    /// Opacity at the lifespan's top.
     pub(super) opacity: f64,
-    /// Outside of it, nothing is drawn.
+    /// Outside of it, nothing is rendered.
     pub(super) span: [f64; 2],
-    /// Seconds in which the layer comes and goes.
+    /// Seconds in which the layer fades in and out.
     pub(super) cross_fade: [f64; 2],
     pub(super) clip: [f64; 2],
 }
@@ -187,12 +187,12 @@ mod tests {
     }
 
     #[test]
-    fn lives_that_are_fades_already_stay_exact() {
+    fn gaussian_fades_stay_exact() {
         let thin = interval(0.7, 1e-9, 0.2).exact().unwrap();
         assert!((thin.at(0.9) - 0.6 * (-0.5f64).exp()).abs() < 1e-12);
         let long = interval(1.0, 1e9, 0.1).exact().unwrap();
         assert!((long.at(0.0) - 0.6).abs() < 1e-7);
-        // A span that holds the whole life cuts nothing.
+        // A span that holds the whole lifespan cuts nothing.
         let held = Visibility { span: [0.0, 1.5], ..interval(0.7, 1e-9, 0.1) };
         assert_eq!(held.exact().unwrap().center, 0.7);
         assert!(interval(1.0, 0.3, 0.05).exact().is_none());
@@ -210,7 +210,7 @@ mod tests {
             let other = Fade { width: fade.width * factor, ..fade };
             assert!(rms(400, seen.clip, |t| other.at(t) - seen.opacity * seen.sigma(t)) > miss);
         }
-        // A piece in the tail of a life must not bring the whole life along.
+        // A segment in the tail of a lifespan must not bring the whole lifespan along.
         let tail = Visibility { span: [0.0, 0.3], ..interval(1.0, 1e-9, 0.25) };
         assert_eq!(tail.exact(), None);
         assert!(tail.fit().is_none_or(|f| f.at(1.0) < 0.05), "{:?}", tail.fit());
@@ -219,8 +219,8 @@ mod tests {
     }
 
     #[test]
-    fn pieces_of_one_path_give_way_to_each_other() {
-        // One Gaussian for ever, cut into four pieces: together they must stay near 0.6.
+    fn segments_of_one_path_fade_into_each_other() {
+        // One Gaussian with an infinite lifespan, cut into four segments: together they must stay near 0.6.
         let pieces: Vec<Fade> = (0..4)
             .map(|i| {
                 let span = [0.5 * f64::from(i), 0.5 * f64::from(i + 1)];

@@ -1,4 +1,4 @@
-//! Files that splat4d does not read: what each is, and what to do with it.
+//! Files that splat4d does not read: the format of each and a remedy.
 
 use crate::{Error, ErrorKind};
 
@@ -6,9 +6,9 @@ use crate::{Error, ErrorKind};
 struct Foreign {
     /// Whether bytes are such a file.
     is: fn(&[u8]) -> bool,
-    /// What the file is.
+    /// The kind of file.
     what: &'static str,
-    /// What to do in its place.
+    /// The remedy.
     remedy: &'static str,
 }
 
@@ -97,7 +97,7 @@ const FOREIGN: [Foreign; 15] = [
 
 /// How packed files begin: 7z, RAR, Zstandard, xz, bzip2. (.spz begins as gzip does.)
 const PACKED: [&[u8]; 5] = [b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x2f\xfd", b"\xfd7zXZ\0", b"BZh"];
-/// What to do with a mesh.
+/// Remedy for a mesh.
 const MESH: &str = "A mesh holds no Gaussians. Its points can start a training: give them to a capture as .ply.";
 
 /// Endings of formats without a mark.
@@ -116,7 +116,7 @@ const ENDINGS: [(&str, &str, &str); 8] = [
     (".4dgs", "a .4dgs of another program", "Convert it to numbered .ply files with the program that wrote it."),
 ];
 
-/// Names of files in archives of other programs, by their ends: what such an archive is, and what to do with it.
+/// Names of files in archives of other programs, by their ends: the kind of archive and a remedy.
 const ARCHIVES: [(&str, &str, &str); 1] = [(
     ".npy",
     "a NumPy archive (.npz), not a SOG scene",
@@ -124,7 +124,7 @@ const ARCHIVES: [(&str, &str, &str); 1] = [(
          capture.",
 )];
 
-/// Says what a file is that no reader takes. `name`: the file's, for formats without a mark; may be empty.
+/// Identifies a file that no reader supports. `name`: the file's, for formats without a mark; may be empty.
 pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
     let name = name.to_ascii_lowercase();
     let by_mark = FOREIGN.iter().find(|f| (f.is)(bytes)).map(|f| (f.what, f.remedy));
@@ -133,7 +133,7 @@ pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
     Some(error(what, remedy))
 }
 
-/// Says what a zip archive without the files of a SOG scene is.
+/// Identifies a zip archive without the files of a SOG scene.
 pub fn archive(names: &[String]) -> Option<Error> {
     let (_, what, remedy) = ARCHIVES.iter().find(|(end, ..)| names.iter().any(|n| n.ends_with(end)))?;
     Some(error(what, remedy))

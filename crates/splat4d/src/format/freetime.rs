@@ -1,7 +1,7 @@
 //! Gaussians of FreeTimeGS (Wang et al. 2025) as FreeTimeGsVanilla stores them, in checkpoints and `.ftgs.ply`.
 //!
-//! On a clock from 0 (first frame) to 1 (last frame): μ(t) = μ + v (t − c), opacity · exp(−½((t − c)/e^d)²), e^d at least
-//! 0.02. All else is 3DGS with spherical harmonics. Files do not state seconds: 30 frames a second are assumed.
+//! On a clock from 0 (first frame) to 1 (last frame): μ(t) = μ + v (t − c), opacity · exp(−½((t − c)/e^d)²), e^d at
+//! least 0.02. All else is 3DGS with spherical harmonics. Files do not state seconds: 30 frames per second are assumed.
 //! Source: OpsiClear-4DGS/FreeTimeGsVanilla, README, "FTGS PLY layout, version 1".
 
 use super::dialect::Y_DOWN;
@@ -18,7 +18,7 @@ pub(super) const SHORTEST: f64 = 0.02;
 /// Length that is assumed where no number of frames is stated, seconds.
 const UNKNOWN_CLIP: f64 = 1.0;
 
-/// What a Gaussian has in addition to 3DGS, a row each.
+/// Columns in addition to 3DGS, one row per Gaussian.
 pub(super) struct Moves {
     pub(super) times: Vec<f32>,
     pub(super) log_durations: Vec<f32>,
@@ -26,16 +26,16 @@ pub(super) struct Moves {
     pub(super) velocities: Vec<f32>,
 }
 
-/// The seconds of a clip of so many frames.
+/// The seconds of a clip of this many frames.
 pub(super) fn duration(frames: Option<usize>, warnings: &mut Warnings) -> f64 {
     match frames.filter(|n| *n > 1) {
         Some(n) => {
             warnings
-                .say(format!("the file states {n} frames, but no frame rate: {DEFAULT_FPS} per second are assumed"));
+                .add(format!("the file states {n} frames, but no frame rate: {DEFAULT_FPS} per second are assumed"));
             (n - 1) as f64 / DEFAULT_FPS
         }
         None => {
-            warnings.say("the file does not state its duration: one second is assumed");
+            warnings.add("the file does not state its duration: one second is assumed");
             UNKNOWN_CLIP
         }
     }

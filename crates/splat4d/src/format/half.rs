@@ -48,7 +48,7 @@ mod tests {
     }
 
     #[test]
-    fn every_binary16_number_comes_back_and_others_go_to_the_nearest() {
+    fn every_binary16_number_round_trips_and_others_are_rounded() {
         for bits in 0..=u16::MAX {
             let x = f16_to_f32(bits);
             if x.is_nan() {

@@ -13,16 +13,16 @@ use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// Width, in clips, of a fade that stands for "lives for ever": over the clip it dims by 1e-8.
+/// Width, in clips, of a fade that represents an infinite lifespan: over the clip it dims by 1e-8.
 pub(super) const FOREVER: f64 = 1e4;
 /// Least logit of an opacity that was fitted: nothing is seen of it.
 const LEAST_LOGIT: f64 = -20.0;
-/// Narrowest fade that is believed, in clips: below it lies no number, and nothing to see.
+/// Narrowest fade that is accepted, in clips: narrower ones are outside the number range and invisible.
 const NARROWEST: f64 = 1e-7;
 /// Assumed length of a file without a clock of its own: one second.
 const UNKNOWN_CLIP: f64 = 1.0;
 
-/// Where the file's 0 and 1 are on the scene clock.
+/// The file's 0 and 1 on the scene clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Clock {
     /// First and last second of the clip.
@@ -42,7 +42,7 @@ impl Clock {
 
     /// The clock assumed for a file that gives none.
     pub(super) fn assumed(warnings: &mut Warnings) -> Self {
-        warnings.say("the file does not state its duration: one second is assumed");
+        warnings.add("the file does not state its duration: one second is assumed");
         Self { clip: [0.0, UNKNOWN_CLIP], fps: crate::scene::time::DEFAULT_FPS, duration: UNKNOWN_CLIP }
     }
 }
@@ -168,7 +168,8 @@ pub(super) fn rows(
             out.push(moving.recentered(there));
         }
     }
-    let what = "have a life with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
+    let what =
+        "have a lifespan with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
     warnings.counted(fitted, scene.len(), what);
     warnings.counted(unseen, scene.len(), "are never seen within the clip and were left out");
     if shaded > 0 {
@@ -316,7 +317,7 @@ pub(super) mod tests {
             let rows = rows(&scene, clock, ".splatv", false, &mut warnings).unwrap();
             assert_eq!(rows.len(), 30);
             let said = warnings.lines().join("\n");
-            assert!(said.contains("of 30 Gaussians have a life with a flat top"), "{said}");
+            assert!(said.contains("of 30 Gaussians have a lifespan with a flat top"), "{said}");
             // Paths and shapes are unchanged, about another centre.
             let back = super::scene(&rows, clock).unwrap();
             let whole = Scene { layers: vec![Layer { span: ALWAYS, ..scene.layers[0].clone() }], ..scene.clone() };

@@ -1,4 +1,4 @@
-//! Numbers that a program stored as they are, where the format has logarithms, logits and coefficients.
+//! Numbers that a program stored unconverted, where the format has logarithms, logits and coefficients.
 
 use super::bytes::SH_C0;
 use super::mend::{FLAT, OPAQUE};
@@ -9,7 +9,7 @@ use crate::math::{median, median_by};
 use crate::scene::params::{LOG_SCALE, OPACITY};
 use crate::scene::{GEOMETRY, Params, SH};
 
-/// Values that a program stored as they are, where the format has logarithms, logits and coefficients.
+/// Values that a program stored unconverted, where the format has logarithms, logits and coefficients.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Linear {
     /// Scales are lengths.
@@ -35,11 +35,11 @@ impl Linear {
 const FEW: usize = 20;
 /// Share of the Gaussians that is most of them.
 const MOST: f64 = 0.5;
-/// Of scenes of logarithms, hardly a Gaussian is as large as a quarter of the inner half of the scene; of lengths read as
-/// logarithms, e^s ≥ 1, most are wherever the scene is not far larger than a unit.
+/// Of scenes of logarithms, hardly a Gaussian is as large as a quarter of the inner half of the scene; of lengths read
+/// as logarithms, e^s ≥ 1, most are wherever the scene is not far larger than a unit.
 const LARGE: f64 = 0.25;
-/// In larger scenes: lengths below a unit, read as logarithms, would all be between 1 and e units in every direction. No
-/// trained scene has such sizes.
+/// In larger scenes: lengths below a unit, read as logarithms, would all be between 1 and e units in every direction.
+/// No trained scene has such sizes.
 const UNIT: f32 = 1.0;
 /// White in opacities and colours that are bytes, and in opacities that are percent.
 const BYTE: f32 = 255.0;
@@ -47,7 +47,7 @@ const PERCENT: f32 = 100.0;
 /// Base colours of trained scenes seldom exceed this coefficient, which is more than twice as bright as white.
 const BRIGHTEST: f32 = 6.0;
 
-/// What the values of a layer suggest is stored as it is. Evidence, not proof: nothing is converted.
+/// Which values of a layer appear to be stored unconverted. Evidence, not proof: nothing is converted.
 pub(super) fn doubts(params: &Params) -> Vec<(Linear, String)> {
     let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
     let finite = |&r: &usize| {
@@ -107,8 +107,8 @@ fn lengths(params: &Params, rows: &[usize]) -> Option<String> {
     ))
 }
 
-/// Evidence that opacities are alphas. Logits of trained scenes spread far to both sides of zero, and seldom beyond those
-/// of opaque Gaussians; a single value may be anything, but for 1, which scripts write for opaque.
+/// Evidence that opacities are alphas. Logits of trained scenes spread far to both sides of zero, and seldom beyond
+/// those of opaque Gaussians; a single value may be anything, but for 1, which scripts write for opaque.
 fn alphas(of: &Spread) -> Option<String> {
     let opaque = of.low == 1.0 && of.high == 1.0;
     let parts = of.high <= 1.0 && of.low < of.high || opaque;
@@ -133,7 +133,7 @@ fn rgb(of: &Spread) -> Option<String> {
     })
 }
 
-/// The number that stands for an alpha of 1.
+/// The number that represents an alpha of 1.
 fn white_of_alphas(of: &Spread) -> f32 {
     match () {
         () if of.middle <= 1.0 => 1.0,
@@ -142,7 +142,7 @@ fn white_of_alphas(of: &Spread) -> f32 {
     }
 }
 
-/// The number that stands for full colour.
+/// The number that represents full colour.
 fn white_of_colours(of: &Spread) -> f32 {
     if of.middle <= 1.0 { 1.0 } else { BYTE }
 }
@@ -156,8 +156,8 @@ fn radius(params: &Params, rows: &[usize]) -> f64 {
     of(means.iter().map(|m| norm(sub(*m, middle))).collect())
 }
 
-/// Reads values that are stored as they are: lengths become logarithms, alphas logits, RGB coefficients. Says what was out of
-/// range.
+/// Reads values that are stored unconverted: lengths become logarithms, alphas logits, RGB coefficients. Returns what
+/// was out of range.
 pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     let [geometry, sh] = layer.params.get_mut([GEOMETRY, SH]);
     let (mut outside, rows) = (0, geometry.rows());
@@ -193,7 +193,7 @@ pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     };
     let mut warnings = Warnings::default();
     if white != 1.0 {
-        warnings.say(format!("{} are read from 0 to {white}", what.name()));
+        warnings.add(format!("{} are read from 0 to {white}", what.name()));
     }
     warnings.counted(outside, rows, &range);
     warnings
@@ -205,7 +205,7 @@ mod tests {
     use crate::format::dialect::still;
     use crate::format::samples::gaussians;
 
-    /// Every value of trained Gaussians as it is: opacities up to `alpha`, colours up to `white`.
+    /// Every value of trained Gaussians unconverted: opacities up to `alpha`, colours up to `white`.
     fn stored(logs: &Params, alpha: f32, white: f32) -> Params {
         let mut linear = logs.clone();
         for row in 0..logs.len() {

@@ -50,8 +50,8 @@ impl Mended {
         out
     }
 
-    /// Says so.
-    pub(super) fn say(&self, of: usize, warnings: &mut Warnings) {
+    /// Reports it.
+    pub(super) fn report(&self, of: usize, warnings: &mut Warnings) {
         warnings.counted(self.opaque, of, "have opacity +infinity: they are opaque");
         warnings.counted(self.invisible, of, "have opacity -infinity: their alpha is 0, they are never seen");
         warnings.counted(self.flat, of, "have a scale of -infinity: they are flat");
@@ -69,14 +69,14 @@ pub(super) fn median_size(params: &Params) -> Option<f64> {
     median_by(&mut sizes, f32::total_cmp).map(|size| f64::from(size).exp())
 }
 
-/// Says how coarse f32 is at the largest coordinates, where that shows.
-pub(super) fn say_coarse(params: &Params, warnings: &mut Warnings) {
+/// Reports how coarse f32 is at the largest coordinates, where that is visible.
+pub(super) fn warn_coarse(params: &Params, warnings: &mut Warnings) {
     let table = &params[GEOMETRY];
     let far = (0..table.rows()).flat_map(|r| table.read::<3>(r, 0)).filter(|x| x.is_finite());
     let far = far.fold(0.0f32, |m, x| m.max(x.abs()));
     let (step, Some(size)) = (f64::from(far.next_up()) - f64::from(far), median_size(params)) else { return };
     if step > VISIBLE * size {
-        warnings.say(format!(
+        warnings.add(format!(
             "positions reach {far}, where single precision has steps of {step:.2e}: {:.2} of the size of the median Gaussian. \
              Export them relative to the scene's middle, or in double precision",
             step / size
@@ -90,7 +90,7 @@ mod tests {
     use crate::format::samples::gaussians;
 
     #[test]
-    fn infinities_that_mean_something_become_finite_and_are_counted() {
+    fn meaningful_infinities_become_finite_and_are_counted() {
         let mut p = gaussians(5, 3);
         p[GEOMETRY].set(0, OPACITY, f32::INFINITY);
         p[GEOMETRY].set(1, OPACITY, f32::NEG_INFINITY);
@@ -102,19 +102,19 @@ mod tests {
         assert_eq!((g.get(0, OPACITY), g.get(1, OPACITY), g.get(2, LOG_SCALE + 1)), (OPAQUE, -OPAQUE, FLAT));
         assert!(g.get(3, LOG_SCALE).is_infinite(), "an infinite size is damage");
         let mut warnings = Warnings::default();
-        mended.say(5, &mut warnings);
+        mended.report(5, &mut warnings);
         assert_eq!(warnings.lines().len(), 3);
         assert_eq!(Mended::of(&mut p), Mended::default());
     }
 
     #[test]
-    fn coarse_coordinates_are_reported_only_where_they_show() {
+    fn coarse_coordinates_are_reported_only_if_visible() {
         let mut p = gaussians(50, 2);
         let mut warnings = Warnings::default();
-        say_coarse(&p, &mut warnings);
+        warn_coarse(&p, &mut warnings);
         assert!(warnings.lines().is_empty());
         (0..50).for_each(|row| p[GEOMETRY].add(row, 0, [5.4e6]));
-        say_coarse(&p, &mut warnings);
+        warn_coarse(&p, &mut warnings);
         assert!(warnings.lines()[0].contains("steps of 5.00e-1"), "{warnings:?}");
     }
 }

@@ -46,8 +46,8 @@ pub use warnings::Warnings;
 use crate::layers::Scene;
 use crate::{Error, Result};
 
-/// The files of Gaussians that other programs share. What is known of a dialect stands in its own file; nothing else lists
-/// them. Where two know a file by its bytes, the later one is right: a layout inside another one stands behind it.
+/// The files of Gaussians that other programs share. A dialect's properties are in its own file; nothing else lists
+/// them. Where two recognise a file by its bytes, the later one counts: a layout inside another one is listed after it.
 pub const DIALECTS: &[Dialect] = &[
     ply::DIALECT,
     ply::COMPRESSED,
@@ -66,8 +66,8 @@ pub const DIALECTS: &[Dialect] = &[
     checkpoint::DIALECT,
 ];
 
-/// The scene in a file of any kind that states by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
-/// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
+/// The scene in a file of any kind that its first bytes identify: `.s4d`, .ply (3DGS, compressed, Spacetime Gaussians),
+/// .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
 /// Assumptions are not returned; [`Dialect::open`] returns them. Errors: no such kind; the reader's.
 pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {

@@ -3,7 +3,7 @@
 use crate::math::Rng;
 
 /// `count` damaged versions of `sample`: flipped bits, changed bytes, cuts, splices, repeats, and digits grown in
-/// place, so that text headers are as well.
+/// position, so that text headers are as well.
 pub(super) fn mutants(sample: &[u8], count: u64, purpose: &str) -> impl Iterator<Item = Vec<u8>> {
     (0..count).map(move |i| {
         let rng = Rng::new(11, purpose, i);
@@ -13,7 +13,7 @@ pub(super) fn mutants(sample: &[u8], count: u64, purpose: &str) -> impl Iterator
             if bytes.is_empty() {
                 break;
             }
-            // Half of the damage goes to the first bytes, where headers are.
+            // Half of the damage is in the first bytes, where headers are.
             let range = if r.below(0, 2) == 0 { bytes.len().min(256) } else { bytes.len() };
             let at = r.below(1, range);
             match r.below(2, 7) {

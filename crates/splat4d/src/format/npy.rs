@@ -215,7 +215,7 @@ struct Header {
     big: bool,
     fortran: bool,
     shape: Vec<usize>,
-    /// Where the numbers begin.
+    /// Offset of the numbers.
     body: usize,
 }
 

@@ -1,4 +1,4 @@
-//! Quantisers: how a number becomes an integer code and comes back, each with its error bound.
+//! Quantisers: from a number to an integer code and back, each with its error bound.
 //!
 //! They are shared by every compact format. Encoding clamps, so that no input gives a code out of range.
 

@@ -5,8 +5,7 @@
 //!
 //! Why not the `safetensors` crate (0.8.0, Apache-2.0, bounds-checked and sound when read): it keeps metadata in a
 //! `HashMap`, so that the same scene gives files of different bytes (15 kinds in 20 writes of four keys), while our
-//! runs must repeat byte for byte; it takes a name that stands twice without a word; and its errors do not name the
-//! array.
+//! runs must repeat byte for byte; it accepts a duplicate name silently; and its errors do not name the array.
 
 use crate::{Error, ErrorKind, Result};
 use flate2::Crc;
@@ -20,8 +19,8 @@ use std::io::Write;
 const MAX_HEADER: usize = 100_000_000;
 /// The header's key for free text.
 const METADATA: &str = "__metadata__";
-/// The metadata's key for checksums: JSON, a CRC-32 in hexadecimal for the bytes of every array, and under the empty name for
-/// all other metadata. Other readers pass over it.
+/// The metadata's key for checksums: JSON, a CRC-32 in hexadecimal for the bytes of every array, and under the empty
+/// name for all other metadata. Other readers pass over it.
 const CHECKSUMS: &str = "splat4d-crc32";
 /// The header is padded with spaces to a multiple of this, so that the first array is aligned.
 const ALIGN: usize = 8;
@@ -167,8 +166,8 @@ impl<'a> SafeTensors<'a> {
     /// Reads a file; the arrays borrow its bytes.
     ///
     /// Errors: a header that is too long, not JSON or names an array twice; an unknown type; a shape that does not
-    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends; an array or metadata that is not
-    /// what a checksum was made of.
+    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends; an array or metadata that
+    /// is not what a checksum was made of.
     pub fn read(bytes: &'a [u8]) -> Result<Self> {
         let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
             return Err(broken("the file is shorter than its header's length"));
@@ -251,7 +250,7 @@ impl<'a> SafeTensors<'a> {
 /// Writes a file: the same arrays and metadata always give the same bytes.
 ///
 /// Arrays are ordered by the size of their numbers, largest first, so that every array is aligned, then by name: how
-/// the tables came about does not show.
+/// the tables were made does not matter.
 ///
 /// Errors: the sink's. Panics: two arrays of one name, or one called `__metadata__`.
 pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
@@ -285,7 +284,7 @@ fn hexadecimal(sum: u32) -> String {
     format!("{sum:08x}")
 }
 
-/// Metadata with the checksums of a file's arrays and of itself; a file without metadata goes without.
+/// Metadata with the checksums of a file's arrays and of itself; a file without metadata has none.
 pub(crate) fn sealed(
     metadata: &BTreeMap<String, String>,
     sums: impl Iterator<Item = (String, u32)>,
@@ -339,7 +338,7 @@ pub(crate) fn header<'a>(
     [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat()
 }
 
-/// The header as it stands in the file; a list, so that a name that stands twice is seen.
+/// The header of the file; a list, so that a name that occurs twice is seen.
 #[derive(Default)]
 struct Header {
     metadata: BTreeMap<String, String>,

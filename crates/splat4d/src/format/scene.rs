@@ -2,9 +2,10 @@
 //!
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some,
 //! `offset` (world coordinates of the scene's origin) where it is not zero, and a list of layers with name, rows, SH
-//! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
-//! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
-//! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
+//! coefficients, life and motion, `frame` where the layer's axes are not the world's, and `cross_fade` (seconds at the
+//! span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means`
+//! `[N,3]`, `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and
+//! scene units.
 
 use super::arrays::MASKS;
 use super::safetensors::{Dtype, SafeTensors, Tensor, checksum, header, sealed};
@@ -28,7 +29,7 @@ pub(crate) const VERSION: u64 = 4;
 const FADING: u64 = 3;
 /// The version of scenes whose layers have frames, and do not cross-fade.
 const FRAMED: u64 = 2;
-/// The version of scenes whose layers have no frame: programs that know no frames may read them.
+/// The version of scenes whose layers have no frame: programs without support for frames may read them.
 const UNFRAMED: u64 = 1;
 /// The metadata's key.
 pub const METADATA: &str = "splat4d";
@@ -38,7 +39,7 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
     about(scene, scene.layers.iter().map(Stated::of).collect())
 }
 
-/// What a file's metadata states of a layer.
+/// A layer in a file's metadata.
 struct Stated {
     json: Value,
     framed: bool,
@@ -54,7 +55,7 @@ impl Stated {
             "life": l.life.name(),
             "motion": spec_to_json(&l.motion.spec()),
         });
-        // JSON knows no infinity: a side that is open is null, and a layer that is always seen states nothing.
+        // JSON has no infinity: a side that is open is null, and a layer that is always seen states nothing.
         if l.span != ALWAYS {
             layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
         }
@@ -105,7 +106,8 @@ pub fn spec_to_json(spec: &Spec) -> Value {
     }
 }
 
-/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or wrong.
+/// A motion model's spec from JSON. Errors: a model that this version does not support, or a field that is missing or
+/// wrong.
 pub fn spec_from_json(v: &Value) -> Result<Spec> {
     let model = text(v, "model")?;
     if v["custom"].as_bool() == Some(true) {
@@ -125,7 +127,7 @@ pub fn spec_from_json(v: &Value) -> Result<Spec> {
         )
         .remedy("Open it with the splat4d that wrote it, or a newer one"));
     }
-    serde_json::from_value(v.clone()).map_err(|e| broken(format!("its motion `{model}` is not as it should be: {e}")))
+    serde_json::from_value(v.clone()).map_err(|e| broken(format!("invalid motion `{model}`: {e}")))
 }
 
 /// All arrays of a scene, ready to be written (also into a checkpoint).
@@ -133,8 +135,8 @@ pub fn arrays(scene: &Scene<f32>) -> Vec<super::arrays::Array> {
     scene.layers.iter().enumerate().flat_map(|(i, l)| params_to_arrays(&format!("layers.{i}."), &l.params)).collect()
 }
 
-/// The masks of a scene's layers, ready to be written (also into a checkpoint): `layers.i.masks`, u32 [keys, ⌈rows/32⌉],
-/// row i is bit i % 32 of word i / 32. Their times are in the metadata.
+/// The masks of a scene's layers, ready to be written (also into a checkpoint): `layers.i.masks`, u32 [keys,
+/// ⌈rows/32⌉], row i is bit i % 32 of word i / 32. Their times are in the metadata.
 pub fn masks(scene: &Scene<f32>) -> Vec<Tensor<'_>> {
     fn of((i, layer): (usize, &Layer<f32>)) -> Option<Tensor<'_>> {
         let m = layer.masks.as_deref()?;
@@ -173,10 +175,10 @@ fn check(scene: &Scene<f32>) -> Result<()> {
     Ok(())
 }
 
-/// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers; `layer` is
-/// asked for each of the `count` twice.
+/// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers;
+/// `layer` is requested each of the `count` twice.
 ///
-/// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` answers twice differently, or with masks.
+/// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` returns different results, or masks.
 pub fn write_by_layer(
     scene: &Scene<f32>,
     count: usize,
@@ -263,7 +265,7 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
     Ok(scene)
 }
 
-/// How blended channels become colour; files that do not say it have no head.
+/// How blended channels become colour; files without it have no head.
 fn head(meta: &Value) -> Result<Head> {
     if meta["head"].is_null() {
         return Ok(Head::Identity);
@@ -278,7 +280,7 @@ fn head(meta: &Value) -> Result<Head> {
     })
 }
 
-/// The scene's labels; none where nothing is said.
+/// The scene's labels; none where the file has none.
 fn label_names(meta: &Value) -> Result<Vec<String>> {
     if meta["labels"].is_null() {
         return Ok(Vec::new());
@@ -351,7 +353,7 @@ fn read_masks(file: &SafeTensors<'_>, meta: &Value, prefix: &str, rows: usize) -
     Ok(Some(Arc::new(masks)))
 }
 
-/// When the layer is seen; a side that is null is open, and so are both where nothing is said.
+/// When the layer is seen; a side that is null is open, and so are both where the file states nothing.
 fn span(meta: &Value) -> Result<[f64; 2]> {
     if meta["span"].is_null() {
         return Ok(ALWAYS);
@@ -365,7 +367,7 @@ fn span(meta: &Value) -> Result<[f64; 2]> {
     Ok(out)
 }
 
-/// The similarity from the layer's axes to the world's; the identity where nothing is said.
+/// The similarity from the layer's axes to the world's; the identity where the file states nothing.
 fn frame(meta: &Value) -> Result<Sim3> {
     let frame = &meta["frame"];
     if frame.is_null() {
@@ -473,7 +475,7 @@ mod tests {
     }
 
     #[test]
-    fn cross_fades_come_back_and_older_readers_refuse_them() {
+    fn cross_fades_round_trip_and_older_readers_refuse_them() {
         let mut s = scene();
         s.layers[1].cross_fade = [0.1 + 0.2, 0.0];
         let mut bytes = Vec::new();
@@ -505,7 +507,7 @@ mod tests {
     }
 
     #[test]
-    fn features_come_back_and_have_one_width() {
+    fn features_round_trip_and_have_one_width() {
         let mut s = scene();
         let key = features::claim(&mut s.layers[1].params, 3).unwrap();
         s.layers[1].params[key].write(2, 0, [0.5, -1.5, 2.0]);
@@ -521,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_come_back_and_older_readers_refuse_them() {
+    fn labels_round_trip_and_older_readers_refuse_them() {
         let mut s = scene();
         s.labels = vec!["floor".into(), "hand".into()];
         scene_labels::state(&mut s.layers[1].params, 2, &[Some(1); 37]);
@@ -560,7 +562,7 @@ mod tests {
     }
 
     #[test]
-    fn a_head_comes_back_and_must_fit_its_layers() {
+    fn a_head_round_trips_and_must_fit_its_layers() {
         let features = Some(crate::motion::spacetime::FeatureSpec { seed: 9 });
         let spec = Spec::Spacetime(SpacetimeSpec { features, ..SpacetimeSpec::default() });
         let mut params = Params::new(5, 1, LifeKind::GaussHalf.columns());
@@ -583,7 +585,7 @@ mod tests {
             let error = with(head, vec![layer]).unwrap_err().to_string();
             assert!(error.contains(head.name()), "{error}");
         }
-        // Scenes without a head say nothing of features: older versions read them.
+        // Scenes without a head carry no information about features: older versions read them.
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
         assert!(!String::from_utf8_lossy(&bytes).contains("features"));
@@ -595,13 +597,13 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_named() {
+    fn mismatches_are_named() {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
         let bytes = unsealed(bytes);
         let with = |from: &str, to: &str| {
             assert_eq!(from.len(), to.len());
-            // Names of arrays stand in the list of checksums too.
+            // Names of arrays are in the list of checksums too.
             let places: Vec<usize> = (0..bytes.len()).filter(|&at| bytes[at..].starts_with(from.as_bytes())).collect();
             assert!(!places.is_empty(), "{from}");
             let mut b = bytes.clone();
@@ -629,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_not_written() {
+    fn non_finite_scenes_are_not_written() {
         let refused = |s: &Scene<f32>| {
             let mut bytes = Vec::new();
             let error = write(s, &mut bytes).unwrap_err().to_string();

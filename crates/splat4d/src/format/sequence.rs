@@ -1,4 +1,4 @@
-//! Frames of plain Gaussians, one file each, as one moving scene: every Gaussian lives for its own frame.
+//! Frames of plain Gaussians, one file each, as one moving scene: every Gaussian is alive during its own frame.
 
 use crate::layers::{Layer, Scene};
 use crate::math::sh;
@@ -11,16 +11,16 @@ use std::sync::Arc;
 /// enough for f32 seconds.
 const SOFT: f64 = 1e-3;
 
-/// Joins frames into a scene of `fps` frames a second that begins at 0 s. Frame i is seen from half a frame before i/fps to
-/// half a frame behind it.
+/// Joins frames into a scene of `fps` frames per second that begins at 0 s. Frame i is seen from half a frame before
+/// i/fps to half a frame behind it.
 ///
 /// Errors: no frames; more than 2^32 Gaussians. Panics: `fps` is not positive.
 pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
     join_at(frames, &(0..frames.len() as u64).collect::<Vec<_>>(), fps, up)
 }
 
-/// The same for frames with numbers that rise, not always by one: frame i is seen at numbers\[i]/fps, and between frames whose
-/// numbers leave a gap nothing is.
+/// The same for frames with numbers that rise, not always by one: frame i is seen at numbers\[i]/fps, and between
+/// frames whose numbers leave a gap nothing is.
 ///
 /// Errors, panics: as [`join`]. Panics: there are more or fewer numbers than frames.
 pub fn join_at(frames: &[Params], numbers: &[u64], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
@@ -63,7 +63,7 @@ mod tests {
     use crate::scene::params::OPACITY;
 
     #[test]
-    fn each_frame_is_seen_in_its_time_and_alone() {
+    fn each_frame_is_visible_alone_at_its_time() {
         let mut frames = [gaussians(30, 1), gaussians(20, 4), gaussians(0, 1), gaussians(10, 9)];
         for f in &mut frames {
             (0..f.len()).for_each(|row| f[GEOMETRY].set(row, OPACITY, 3.0));

@@ -1,4 +1,4 @@
-//! `.splat`: 32 bytes a Gaussian and nothing else, not even a magic number.
+//! `.splat`: 32 bytes per Gaussian and nothing else, not even a magic number.
 //!
 //! position 3×f32, **linear** scale 3×f32, colour rgb u8 (½ + C0·f_dc, no view dependence), opacity u8, quaternion wxyz
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
@@ -24,12 +24,12 @@ pub const DIALECT: Dialect = Dialect {
     world: false,
 };
 
-/// Bytes a Gaussian.
+/// Bytes per Gaussian.
 pub(crate) const ROW: usize = 32;
 /// A linear scale of zero or below is read as this: no logarithm, and nothing to see either.
 const SMALLEST_SCALE: f32 = 1e-30;
 
-/// Reads Gaussians. Errors: the length is no multiple of 32, or there is nothing.
+/// Reads Gaussians. Errors: the length is not a multiple of 32, or there is nothing.
 pub fn read(bytes: &[u8]) -> Result<(Params, Warnings)> {
     if bytes.is_empty() || !bytes.len().is_multiple_of(ROW) {
         return Err(Error::input(format!("a .splat file has 32 bytes a Gaussian, this one has {} bytes", bytes.len()))
@@ -60,7 +60,7 @@ pub(crate) fn write(params: &Params, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
     if sh.width() > 3 {
-        warnings.say("view dependence (spherical harmonics above degree 0) is left out: .splat holds one colour");
+        warnings.add("view dependence (spherical harmonics above degree 0) is left out: .splat holds one colour");
     }
     let mut clipped = 0;
     let mut bytes = Vec::with_capacity(params.len() * ROW);
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_clipped_or_damaged_is_counted() {
+    fn clipped_and_damaged_values_are_counted() {
         let mut p = gaussians(3, 1);
         p[SH].write(0, 0, [9.0, 0.0, 0.0]);
         p[SH].write(1, 0, [0.0; 3]);

@@ -1,10 +1,11 @@
 //! `.splatv`: moving Gaussians as the texture of splaTV's and gsplat.js's players.
 //!
 //! u32 0x674B, u32 length of a JSON text, the text (a list of chunks; all known files have one of type "splat" with
-//! `size`, `texwidth` 4096, `texheight` and `cameras`), then the chunk: 64 bytes a Gaussian. Words: 0–2 position f32, 3–4
-//! quaternion 4×f16 wxyz, 5–6 **linear** scale 3×f16, 7 colour rgb and opacity u8, 8–12 path 9×f16, 13–14 quaternion rate
-//! 4×f16, 15 centre and width 2×f16. Opacity·exp(−((t − centre)/width)²), **no ½**; t runs from 0 to 1 over the clip.
-//! No spherical harmonics. We add the key `splat4d` with clip and frame rate, which other programs pass over.
+//! `size`, `texwidth` 4096, `texheight` and `cameras`), then the chunk: 64 bytes per Gaussian. Words: 0–2 position f32,
+//! 3–4 quaternion 4×f16 wxyz, 5–6 **linear** scale 3×f16, 7 colour rgb and opacity u8, 8–12 path 9×f16, 13–14
+//! quaternion rate 4×f16, 15 centre and width 2×f16. Opacity·exp(−((t − centre)/width)²), **no ½**; t runs from 0 to 1
+//! over the clip. No spherical harmonics. We add the key `splat4d` with clip and frame rate, which other programs pass
+//! over.
 //! Source: antimatter15/splaTV and gsplat.js (MIT), their shaders.
 
 use super::bytes::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
@@ -32,7 +33,7 @@ pub const DIALECT: Dialect = Dialect {
 
 /// First four bytes.
 pub(crate) const MAGIC: [u8; 4] = 0x674Bu32.to_le_bytes();
-/// Bytes a Gaussian.
+/// Bytes per Gaussian.
 const ROW: usize = 64;
 /// Texels a row of the texture, 16 bytes each: the players' shaders compute with 1024 Gaussians a row.
 const TEXTURE_WIDTH: usize = 4096;
@@ -44,12 +45,12 @@ const SMALLEST_SCALE: f32 = 6e-8;
 /// Writes a moving scene. The options' cameras are offered by the players; without any, the first of [`Scene::clip`] is
 /// viewed from afar.
 ///
-/// Errors: the scene moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+/// Errors: the format cannot express the scene's motion or lifespans, and fitting is not allowed; the sink's.
 pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let span = scene.clip[1] - scene.clip[0];
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
-    // A single time still needs a clock to stand on.
+    // A single time still needs a clip.
     let clock = Clock { clip: scene.clip, fps, duration: if span > 0.0 { span } else { 1.0 } };
     let rows = rows(scene, clock, ".splatv", options.exact, &mut warnings)?;
     let height = (rows.len() * ROW / 16).div_ceil(TEXTURE_WIDTH).max(1);
@@ -83,7 +84,7 @@ pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -
     Ok(warnings)
 }
 
-/// A camera as 3DGS' cameras.json has it: centre, world-from-camera rotation as rows, focal lengths in pixels.
+/// A camera as in 3DGS' cameras.json: centre, world-from-camera rotation as rows, focal lengths in pixels.
 fn camera_json(id: usize, camera: &Camera) -> Value {
     let r = camera.cam_from_world.rotation;
     let rotation: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| r[j][i]));
@@ -135,7 +136,7 @@ fn pack(m: &Moving, outside: &mut [bool; 2]) -> [u8; ROW] {
 
 /// Reads a moving scene. Without our own key, one second is assumed for the clip.
 ///
-/// Errors: another magic number; JSON that does not say where the Gaussians are; truncated.
+/// Errors: another magic number; JSON that does not state where the Gaussians are; truncated.
 pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     let mut warnings = Warnings::default();
     let mut c = Cursor::new(bytes, ".splatv file");
@@ -157,7 +158,7 @@ pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
         if chunk["type"] == "splat" {
             return splats(chunk, body, warnings);
         }
-        warnings.say(format!("a chunk of type {} is not read", chunk["type"]));
+        warnings.add(format!("a chunk of type {} is not read", chunk["type"]));
     }
     Err(damaged("it has no chunk of type \"splat\""))
 }
@@ -210,7 +211,7 @@ mod tests {
     use crate::layers::Evaluation;
     use crate::scene::{LIFE, LifeKind, Time};
 
-    /// One Gaussian at (1, 2, 3), moving by x = 1 + 2u, turned by nothing, with half its life at 0.5 and s = 0.25.
+    /// One Gaussian at (1, 2, 3), moving by x = 1 + 2u, turned by nothing, with half its lifespan at 0.5 and s = 0.25.
     fn by_hand() -> Vec<u8> {
         let text = br#"[{"type":"splat","size":128,"texwidth":4,"texheight":2,"cameras":[]}]"#;
         let mut file = vec![0x4B, 0x67, 0, 0];
@@ -247,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_moving_scene_comes_back_within_f16() {
+    fn a_dynamic_scene_round_trips_within_f16() {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(1500, life, 3, true);
             let mut file = Vec::new();
@@ -256,7 +257,7 @@ mod tests {
             assert_eq!((back.len(), back.clip, back.fps), (1500, scene.clip, scene.fps));
             assert!(warnings.lines().is_empty(), "{warnings:?}");
             let [mean, cov, opacity] = apart(&scene, &back);
-            // 2^-11 of paths of some 100 units (cubes of 3 s), of sizes up to 3, and of a life's slope.
+            // 2^-11 of paths of some 100 units (cubes of 3 s), of sizes up to 3, and of a lifespan's slope.
             assert!(mean < 0.05 && cov < 0.01 && opacity < 0.004, "{life:?}: {mean} {cov} {opacity}");
         }
     }

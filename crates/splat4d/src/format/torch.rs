@@ -1,9 +1,9 @@
-//! Files of `torch.save` (PyTorch 1.6 and later), read without running anything: a zip with a pickle that names tensors, and
-//! a file for each storage of numbers.
+//! Files of `torch.save` (PyTorch 1.6 and later), read without running anything: a zip with a pickle that names
+//! tensors, and a file for each storage of numbers.
 //!
-//! The pickle is read by a machine that knows the operations of plain data and four callables ([`CALLABLES`]). Whatever else
-//! it names becomes [`Value::Opaque`], is never looked up and never called. Objects are made once by the operation that
-//! pushes them, so that their number is bounded by the bytes of the pickle.
+//! The interpreter of the pickle supports the operations of plain data and four callables ([`CALLABLES`]). Whatever
+//! else it names becomes [`Value::Opaque`], is never looked up and never called. Objects are made once by the operation
+//! that pushes them, so that their number is bounded by the bytes of the pickle.
 //! Sources: Python's `pickletools` documentation (operations), PyTorch documentation, "Serialization semantics".
 
 use super::bytes::Cursor;
@@ -19,7 +19,7 @@ const MOST_PICKLE: usize = 64 << 20;
 /// Most axes of a tensor that is believed.
 const MOST_AXES: usize = 16;
 
-/// What a pickle may call. All of them make plain data.
+/// Functions that a pickle may call. All of them make plain data.
 const CALLABLES: [&str; 4] = [
     "torch._utils _rebuild_tensor_v2",
     "torch._utils _rebuild_parameter",
@@ -27,7 +27,7 @@ const CALLABLES: [&str; 4] = [
     "collections OrderedDict",
 ];
 
-/// A place in the list of objects.
+/// A position in the list of objects.
 type Id = usize;
 
 /// An object of a pickle.
@@ -173,7 +173,7 @@ impl<'a> Torch<'a> {
     /// The numbers of a tensor, row-major. Errors: it is outside its storage, which is missing or too short.
     pub(super) fn numbers(&self, tensor: &Tensor) -> Result<Vec<f32>> {
         let name = format!("{}data/{}", self.folder, tensor.key);
-        // Storages are stored as they are: a small file cannot become a large one.
+        // Storages are stored uncompressed: a small file cannot become a large one.
         let most = self.archive.packed(&name).unwrap_or(0);
         let file = self.archive.file(&name, most).ok_or_else(|| damaged(format!("{name} is missing")))?;
         let (bytes, size) = (file?, tensor.kind.size());
@@ -417,7 +417,7 @@ impl<'a> Machine<'a> {
                 let made = self.call(callable, arguments)?;
                 self.push(made);
             }
-            // State for an object: of what is plain data nothing is missing, and nothing else was made.
+            // State for an object: plain data is complete without it, and nothing else is built.
             b'b' => drop(self.pop()?),
             0x81 => {
                 self.pop()?;
@@ -457,7 +457,7 @@ impl<'a> Machine<'a> {
         if items.len() > MOST_AXES { None } else { items.iter().map(|i| self.count(*i)).collect() }
     }
 
-    /// ("storage", class, key, place, numbers)
+    /// ("storage", class, key, position, numbers)
     fn storage(&self, id: Id) -> Result<Value> {
         let &[_, class, key, _, numbers] = self.items(id) else {
             return Err(damaged("its pickle refers to an object that is not a storage"));
@@ -467,7 +467,7 @@ impl<'a> Machine<'a> {
         Ok(Value::Storage { kind, key: self.words(key)?.to_owned(), numbers })
     }
 
-    /// What a callable of [`CALLABLES`] makes; anything else is not made.
+    /// The result of a callable of [`CALLABLES`]; anything else is refused.
     fn call(&self, callable: Id, arguments: Id) -> Result<Value> {
         let Value::Global(name) = &self.objects[callable] else { return Ok(Value::Opaque) };
         let arguments = self.items(arguments);

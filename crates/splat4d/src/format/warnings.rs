@@ -1,7 +1,7 @@
 //! Warnings about what a file could not hold or what had to be assumed: collected while a dialect is read or written,
 //! printed by the shell.
 
-/// Sentences without a final full stop, in the order in which things came up.
+/// Sentences without a final full stop, in order of occurrence.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Warnings {
     lines: Vec<String>,
@@ -9,14 +9,14 @@ pub struct Warnings {
 
 impl Warnings {
     /// Adds a sentence.
-    pub fn say(&mut self, text: impl Into<String>) {
+    pub fn add(&mut self, text: impl Into<String>) {
         self.lines.push(text.into());
     }
 
     /// Adds "`count` of `of` Gaussians `what`", unless the count is zero.
     pub fn counted(&mut self, count: usize, of: usize, what: &str) {
         if count > 0 {
-            self.say(format!("{count} of {of} Gaussians {what}"));
+            self.add(format!("{count} of {of} Gaussians {what}"));
         }
     }
 
@@ -25,7 +25,7 @@ impl Warnings {
         &self.lines
     }
 
-    /// Leaves out sentences that hold `text`: what they say was settled.
+    /// Removes sentences that contain `text`, because they were resolved.
     pub fn drop(&mut self, text: &str) {
         self.lines.retain(|line| !line.contains(text));
     }

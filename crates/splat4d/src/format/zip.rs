@@ -1,11 +1,12 @@
-//! Just enough of zip for `.sog`, `.npz` and `.usdz`: stored and deflated files, named in the central directory, are read;
-//! stored ones are written.
+//! Just enough of zip for `.sog`, `.npz` and `.usdz`: stored and deflated files, named in the central directory, are
+//! read; stored ones are written.
 //!
-//! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is asked for,
-//! up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise become 200 GB.
+//! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is
+//! requested, up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise
+//! become 200 GB.
 //!
-//! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
-//! compressions, and this is a page.
+//! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten
+//! other compressions, and this is a page.
 
 use super::bytes::Cursor;
 use crate::{Error, ErrorKind, Result};
@@ -29,7 +30,7 @@ const LOCAL_HEADER: usize = 30;
 /// Length of the end record without its comment, and the longest comment.
 const END_LENGTH: usize = 22;
 const MOST_COMMENT: usize = 65_535;
-/// Stands for "see the zip64 record".
+/// Refers to the zip64 record.
 const ZIP64: u32 = u32::MAX;
 /// Deflate shrinks 1032:1 at the very most (zlib technical details).
 const MOST_RATIO: usize = 1032;
@@ -44,7 +45,7 @@ pub struct Archive<'a> {
 
 /// A file of the directory.
 struct Entry {
-    /// Where its packed bytes lie.
+    /// Position of its packed bytes.
     body: Range<usize>,
     /// Length that the directory states for the plain bytes.
     plain: usize,
@@ -107,7 +108,7 @@ impl<'a> Archive<'a> {
         self.entries.keys().cloned().collect()
     }
 
-    /// Name of the file whose bytes stand first.
+    /// Name of the file whose bytes are first.
     pub(crate) fn first(&self) -> Option<&str> {
         self.entries.iter().min_by_key(|(_, e)| e.body.start).map(|(name, _)| name.as_str())
     }
@@ -124,7 +125,7 @@ impl<'a> Archive<'a> {
     }
 }
 
-/// Where the packed bytes of the file lie whose local header stands at `offset`.
+/// Position of the packed bytes of the file whose local header is at `offset`.
 fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<Range<usize>> {
     let mut c = Cursor::new(bytes.get(offset..).unwrap_or_default(), "zip file");
     if c.take(4)? != MAGIC {
@@ -179,7 +180,7 @@ const FILL: u16 = 0x1986;
 /// Length of an extra field's own header.
 const EXTRA: usize = 4;
 
-/// Writes files as they are; the bytes of each begin at a multiple of `align`.
+/// Writes files uncompressed; the bytes of each begin at a multiple of `align`.
 ///
 /// Errors: more than 4 GiB; the sink's.
 pub(super) fn write(files: &[(&str, &[u8])], align: usize, out: &mut dyn Write) -> Result<()> {

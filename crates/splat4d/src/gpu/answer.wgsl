@@ -1,13 +1,13 @@
 // The splats of a layer's rows at time t, and who is alive then. Twin of Motion::at for `still`, `spacetime` and a
-// frame of `tracked`, with the life of layers/envelope.rs; learnt.wgsl is put in front of this file.
+// frame of `tracked`, with the lifespan of layers/envelope.rs; learnt.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1; opacity 0
-// where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views; 4 counts ([3]: stopped). Four storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 query; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1;
+// opacity 0 where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views; 4
+// counts ([3]: stopped). Four storage buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 
-@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(0) var<uniform> query: Query;
 @group(0) @binding(1) var<storage, read> params: array<f32>;
 @group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(3) var<storage, read_write> alive: array<u32>;
@@ -15,28 +15,28 @@ const GEOMETRY_WIDTH: u32 = 10u;
 
 // Phrased so that what is not a number is kept and found by Adam, not hidden.
 fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
-    if (ask.life == LIFE_INFINITE) {
+    if (query.life == LIFE_INFINITE) {
         return false;
     }
-    var reach = exp(params[at(row, ask.life_at + 1u, ask.width)]);
-    if (ask.life == LIFE_INTERVAL) {
-        reach += exp(params[at(row, ask.life_at + 2u, ask.width)]) * ask.widest;
+    var reach = exp(params[at(row, query.life_at + 1u, query.width)]);
+    if (query.life == LIFE_INTERVAL) {
+        reach += exp(params[at(row, query.life_at + 2u, query.width)]) * query.widest;
     } else {
-        reach *= ask.widest;
+        reach *= query.widest;
     }
-    return abs(delta_of(ask, row)) > reach || opacity * sigma < ask.alpha_min;
+    return abs(delta_of(query, row)) > reach || opacity * sigma < query.alpha_min;
 }
 
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Who lives in a step that has stopped must stay known.
-    if (row >= ask.rows || counts[3] != 0u) {
+    // The list of live rows of a stopped step must stay.
+    if (row >= query.rows || counts[3] != 0u) {
         return;
     }
-    let g = moved(ask, row, delta_of(ask, row));
+    let g = moved(query, row, delta_of(query, row));
     let opacity = sigmoid(g.logit);
-    let sigma = life_of(ask, row).x;
+    let sigma = life_of(query, row).x;
     let lives = !dead(row, opacity, sigma);
     let r = rotation_rows(unit_of(g.quat).quat);
     let s = exp(g.log_scale);
@@ -53,7 +53,7 @@ fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     geometry[to + 128u] = dot(r[2] * r[2], s2);
     geometry[to + 144u] = select(0.0, opacity * sigma, lives);
     var mark = select(0u, 1u, lives);
-    if ((ask.flags & ASK_FIRST) == 0u) {
+    if ((query.flags & QUERY_FIRST) == 0u) {
         mark |= alive[row];
     }
     alive[row] = mark;

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Numbers that come back of a splat: five vec4 (splats_back.wgsl).
+/// Numbers returned per splat: five vec4 (splats_back.wgsl).
 const NUMBERS: usize = 20;
 /// Bits of `Blend::flags` in rasterize_back.wgsl.
 const FLAG_ALPHA: u32 = 1;
@@ -25,19 +25,19 @@ pub(super) const FLAG_ABS: u32 = 4;
 /// Splats in a task: whole blocks of a table.
 const CHUNK: usize = 1024;
 
-/// What came back, splat by splat; memory is reused from call to call.
+/// The returned gradients, splat by splat; memory is reused from call to call.
 #[derive(Debug, Default)]
 pub(super) struct Returned {
-    /// 0: not drawn.
+    /// 0: not rendered.
     pub radii: Vec<f32>,
-    /// Of which the CPU's half of the backward pass looks at the radius alone.
+    /// The CPU's half of the backward pass reads only the radius.
     projected: Vec<Projected<f32>>,
     channels: Vec<[f32; CHANNELS]>,
     d_channels: Vec<[f32; CHANNELS]>,
     partial: Vec<[f64; 3]>,
 }
 
-/// Where things are in the memory that the CPU reads.
+/// Offsets in the memory that the CPU reads.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Layout {
     cameras: u64,
@@ -48,7 +48,7 @@ pub(super) struct Layout {
     all: u64,
 }
 
-/// What a submission of the backward pass leaves to the CPU.
+/// Results of a submission of the backward pass for the CPU.
 pub(super) struct Came {
     /// Gradient to the background, by tile.
     pub sums: Vec<f32>,
@@ -58,14 +58,14 @@ pub(super) struct Came {
     pub camera: [f64; CAMERA],
     /// Splats, visible ones, pairs.
     pub counts: Vec<u32>,
-    /// What the tiles add to the loss.
+    /// Contributions of the tiles to the loss.
     pub partials: Vec<f32>,
     /// Milliseconds of the wait, and of the stages.
     pub wait: f64,
     pub stages: [f64; STAGES],
 }
 
-/// Where a backward pass ends.
+/// End of a backward pass.
 #[derive(Clone, Copy)]
 pub(super) enum End {
     /// At sums of records, to which another band adds.
@@ -75,8 +75,7 @@ pub(super) enum End {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels of the backward pass, and draws so that its records have room. Errors: the driver
-    /// refuses one.
+    /// Compiles the kernels of the backward pass, and renders once to size its records. Errors: the driver refuses one.
     pub fn for_training(&mut self) -> Result<()> {
         // Lists may grow by a share more than they need; behind the records are a few sums.
         let room = super::largest_binding(&self.gpu) / (RECORD_BYTES + 1) * SPARE / (SPARE + 1);
@@ -92,7 +91,7 @@ impl GpuRenderer {
     }
 
     /// [`Backend::vjp`](crate::render::Backend::vjp).
-    pub(super) fn take_back(
+    pub(super) fn backward_band(
         &mut self,
         shot: &Shot<'_, f32>,
         grads: &ImageGrads<'_, f32>,
@@ -148,7 +147,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Hands out what came back of all bands.
+    /// Returns the gradients of all bands.
     pub(super) fn deliver(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -167,7 +166,7 @@ impl GpuRenderer {
         self.spread(shot, &came.rows, d_sh, d)
     }
 
-    /// `partials`: numbers of a loss that come back too.
+    /// `partials`: numbers of a loss to return as well.
     pub(super) fn make_room_to_return(
         &mut self,
         n: usize,
@@ -193,7 +192,7 @@ impl GpuRenderer {
         Ok(layout)
     }
 
-    /// Buffers of the gradients to `n` splats and to so many pixels, and of so many bytes of records.
+    /// Buffers of the gradients to `n` splats and to this many pixels, and of this many bytes of records.
     pub(super) fn make_room_for_gradients(&mut self, n: usize, pixels: u64, records: u64) -> Result<()> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();
@@ -221,7 +220,8 @@ impl GpuRenderer {
         }
     }
 
-    /// Takes one band back; `again`: it must be listed and drawn again; `last`: with what came of the splats.
+    /// Runs the backward pass of one band; `again`: it must be listed and rendered again; `last`: also returns the
+    /// splats' gradients.
     fn return_band(
         &self,
         (band, pairs): (Band, usize),
@@ -241,9 +241,8 @@ impl GpuRenderer {
         self.come_back(recorder, (band, pairs), across, end, layout)
     }
 
-    /// The backward pass of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the
-    /// reading of
-    /// what comes of it. `pairs`: so many at most.
+    /// The backward pass of a band whose lists, planes and gradient are available after what `recorder` holds, and the
+    /// reading of the copy of its results. `pairs`: their largest number.
     pub(super) fn come_back(
         &self,
         mut recorder: Recorder<'_>,

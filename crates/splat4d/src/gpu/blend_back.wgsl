@@ -1,13 +1,13 @@
-// What both ways back through a tile share: bindings, and one splat at one pixel. Twin of Returning in render/blend.rs, where
-// the equations stand. render/project.wgsl is put in front of this file.
+// What both ways back through a tile share: bindings, and one splat at one pixel. Twin of Returning in render/blend.rs,
+// which documents the equations. render/project.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile), 3 values, 4 owners, 5 shapes, 6 colors and 7 planes as
-// rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9 records, twelve
-// numbers a pair, cleared to 0 before, and behind them (at blend.sums_at) three a tile, the gradient to the background.
-// Eight storage buffers.
+// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile), 3 values, 4 owners, 5 shapes, 6 colors and 7
+// planes as rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9
+// records, twelve numbers a pair, cleared to 0 before, and behind them (at blend.sums_at) three per tile, the gradient
+// to the background. Eight storage buffers.
 //
-// Of a record: 0 v, 1 v dx, 2 v dx^2, 3 v dy, 4 v dx dy, 5 v dy^2, 6 to 9 gradient to red, green, blue and depth, 10 and
-// 11 absolute gradients to the centre, where they are wanted; v = dL/d ln alpha.
+// Of a record: 0 v, 1 v dx, 2 v dx^2, 3 v dy, 4 v dx dy, 5 v dy^2, 6 to 9 gradient to red, green, blue and depth, 10
+// and 11 absolute gradients to the centre, where they are needed; v = dL/d ln alpha.
 
 const TILE: u32 = 16u;
 // Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
@@ -16,7 +16,7 @@ const OWNER_SHIFT: u32 = 28u;
 const OWNER_SPLAT: u32 = 0x0fffffffu;
 const LOG2_E: f32 = 1.4426950408889634;
 const NUMBERS: u32 = 12u;
-// Bits of blend.flags: there is a gradient to alpha, to depth; absolute gradients are wanted.
+// Bits of blend.flags: there is a gradient to alpha, to depth; absolute gradients are needed.
 const BACK_ALPHA: u32 = 1u;
 const BACK_DEPTH: u32 = 2u;
 const BACK_ABS: u32 = 4u;
@@ -52,8 +52,8 @@ struct Passed {
     open: bool,
 }
 
-// A splat at offset d with the exponent's factors p (rasterize.wgsl) before what is left of the light at a pixel whose gradient
-// is g. limits: log2 of the least and of the largest alpha.
+// A splat at offset d with the exponent's factors p (rasterize.wgsl) before what is left of the light at a pixel whose
+// gradient is g. limits: log2 of the least and of the largest alpha.
 fn passed(d: vec2<f32>, p: vec4<f32>, color: vec4<f32>, g: vec4<f32>, rest: f32, t: f32, limits: vec2<f32>) -> Passed {
     var out = Passed(0.0, 0.0, rest, t, true);
     let power = min((p.z * d.y + p.y * d.x) * d.y + p.x * d.x * d.x + p.w, p.w);
@@ -76,7 +76,8 @@ fn passed(d: vec2<f32>, p: vec4<f32>, color: vec4<f32>, g: vec4<f32>, rest: f32,
     return out;
 }
 
-// The gradient to a pixel's colour and depth, the gradient times all of its light, and what shows through to the background.
+// The gradient to a pixel's colour and depth, the gradient times all of its light, and what shows through to the
+// background.
 struct Seen {
     g: vec4<f32>,
     rest: f32,

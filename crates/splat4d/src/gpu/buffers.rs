@@ -34,7 +34,7 @@ impl Grown {
         Self::new(what, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST)
     }
 
-    /// Sees to it that there are `bytes`. Whether the buffer is a new one: what it held is lost then.
+    /// Ensures a size of `bytes`. Returns whether the buffer is new, with undefined content.
     ///
     /// Errors: more than one binding may hold, or no memory.
     pub(super) fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
@@ -57,7 +57,7 @@ impl Grown {
         if gpu.refused == Some(self.what) {
             return Err(gpu.error(ErrorKind::Memory, format!("{size} bytes of {}", self.what)));
         }
-        // The old one goes first: both together may be more than there is.
+        // The old one is freed first: both together may not fit.
         self.buffer = None;
         self.buffer = Some(gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(self.what),
@@ -68,7 +68,7 @@ impl Grown {
         gpu.check()
     }
 
-    /// Sees to it that there are `bytes`, and no more than that of a buffer that is made: for what never grows.
+    /// Ensures a size of `bytes` without spare capacity, for buffers that never grow.
     ///
     /// Errors: as of [`ensure`](Self::ensure).
     pub(super) fn fit(&mut self, gpu: &Gpu, bytes: u64) -> Result<()> {
@@ -139,23 +139,23 @@ pub(super) struct Buffers {
     pub pair_values: [Grown; 2],
     /// Splat and quadrants of a pair, by its number.
     pub owners: Grown,
-    /// Three numbers a tile.
+    /// Three numbers per tile.
     pub ranges: Grown,
     /// Five planes.
     pub planes: Grown,
-    /// A pixel in 8 bits a channel.
+    /// A pixel in 8 bits per channel.
     pub bytes: Grown,
     /// Gradient to the planes.
     pub d_planes: Grown,
     /// Nine planes of the loss.
     pub maps: Grown,
-    /// Sixteen numbers a tile of the loss.
+    /// Sixteen numbers per tile of the loss.
     pub partials: Grown,
-    /// Twelve sums a pair, then three a tile.
+    /// Twelve sums a pair, then three per tile.
     pub records: Grown,
     /// Twelve a splat.
     pub sums: Grown,
-    /// Twenty numbers a splat for the CPU.
+    /// Twenty numbers per splat for the CPU.
     pub back: Grown,
     /// Six a workgroup.
     pub cameras: Grown,

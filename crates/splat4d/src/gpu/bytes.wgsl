@@ -1,7 +1,7 @@
-// The picture in 8 bits: a quarter of what the planes are to read back. Clamped and rounded as pictures are for people.
+// The image in 8 bits: a quarter of the planes' size to read back. Clamped and rounded as in image files.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 planes of rasterize.wgsl, whose uniforms these are; out: 3 bytes, a u32 a pixel: red
-// in the lowest eight bits, then green, blue and alpha. Two storage buffers. A thread owns every so many-th pixel.
+// Bindings, group 0: 0 view; 1 blend; 2 planes of rasterize.wgsl, whose uniforms these are; out: 3 bytes, a u32 per
+// pixel: red in the lowest eight bits, then green, blue and alpha. Two storage buffers. A thread owns every n-th pixel.
 // render/project.wgsl is put in front of this file.
 
 const BYTES_THREADS: u32 = 256u;

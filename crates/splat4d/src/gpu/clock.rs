@@ -211,12 +211,12 @@ impl<'a> Recorder<'a> {
         self.encoder.clear_buffer(buffer, 0, Some(bytes));
     }
 
-    /// Copies `bytes` from the start of one buffer to a place in another.
+    /// Copies `bytes` from the start of one buffer to a position in another.
     pub(crate) fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer, at: u64, bytes: u64) {
         self.copy_from(from, 0, to, at, bytes);
     }
 
-    /// Copies `bytes` from a place in one buffer to a place in another.
+    /// Copies `bytes` from a position in one buffer to a position in another.
     pub(crate) fn copy_from(&mut self, from: &wgpu::Buffer, first: u64, to: &wgpu::Buffer, at: u64, bytes: u64) {
         self.encoder.copy_buffer_to_buffer(from, first, to, at, bytes);
     }
@@ -225,7 +225,7 @@ impl<'a> Recorder<'a> {
     pub(crate) fn resolve(&mut self, times: &wgpu::Buffer) -> bool {
         let [first, end] = self.recorded;
         let Some(queries) = self.queries.filter(|_| first < end) else { return false };
-        // A place that was never written may not be read.
+        // An entry that was never written may not be read.
         self.encoder.resolve_query_set(queries, 2 * first as u32..2 * end as u32, times, 0);
         true
     }
@@ -240,7 +240,7 @@ impl<'a> Recorder<'a> {
         self.recorded
     }
 
-    /// Submits what was recorded so far.
+    /// Submits the recorded commands.
     pub(crate) fn submit(&mut self) -> wgpu::SubmissionIndex {
         let done = std::mem::replace(&mut self.encoder, encoder(self.gpu));
         self.gpu.queue.submit([done.finish()])

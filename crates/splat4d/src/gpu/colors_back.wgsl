@@ -1,18 +1,17 @@
-// From the gradient to a splat's colour to those of its SH coefficients and, through the direction, of its mean; and what
-// densification wants to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's learner.rs;
-// render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
+// From the gradient to a splat's colour to those of its SH coefficients and, through the direction, of its mean; and
+// the statistics of densification. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's
+// learner.rs; render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 ask; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the SH table; in and
-// out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7 stats, three columns a row: sum
-// of |dL/dmean2d|, number of views that drew it, largest radius; 8 weights of the blocks of SH, of which the gradients take the
-// place. Seven storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 view; 1 query; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the
+// SH table; in and out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7
+// stats, three columns per row: sum of |dL/dmean2d|, number of views that rendered it, largest radius; 8 weights of the blocks
+// of SH, which the gradients replace. Seven storage buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 const STATS_WIDTH: u32 = 3u;
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> ask: Ask;
+@group(0) @binding(1) var<uniform> query: Query;
 @group(0) @binding(2) var<storage, read> counts: array<u32>;
 @group(0) @binding(3) var<storage, read> geometry: array<f32>;
 @group(0) @binding(4) var<storage, read> params: array<f32>;
@@ -52,24 +51,24 @@ fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
 @compute @workgroup_size(ROW_THREADS)
 fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Where steps have stopped there are no gradients: the view is drawn again.
-    if (row >= ask.rows || counts[3] != 0u) {
+    // Where steps have stopped there are no gradients: the view is rendered again.
+    if (row >= query.rows || counts[3] != 0u) {
         return;
     }
-    if ((ask.flags & ASK_FIRST) != 0u) {
-        for (var c = 0u; c < ask.sh_width; c++) {
-            d_sh[at(row, c, ask.sh_width)] = 0.0;
+    if ((query.flags & QUERY_FIRST) != 0u) {
+        for (var c = 0u; c < query.sh_width; c++) {
+            d_sh[at(row, c, query.sh_width)] = 0.0;
         }
     }
     var weight = vec3<f32>(1.0);
-    if (ask.blocks > 1u) {
-        for (var b = 0u; b < ask.blocks; b++) {
-            let i = at(row, b, ask.blocks);
+    if (query.blocks > 1u) {
+        for (var b = 0u; b < query.blocks; b++) {
+            let i = at(row, b, query.blocks);
             weight[b] = weights[i];
             weights[i] = 0.0;
         }
     }
-    let splat = 5u * (ask.first_splat + row);
+    let splat = 5u * (query.first_splat + row);
     let radius = back[splat + 2u].z;
     if (radius <= 0.0) {
         return;
@@ -80,7 +79,7 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     stats[seen + 32u] = max(stats[seen + 32u], radius);
     // A channel that was clamped at 0 passes nothing.
     let v = select(vec3<f32>(0.0), back[splat + 3u].xyz, back[splat + 4u].xyz > vec3<f32>(0.0));
-    let block = ask.sh_width / ask.blocks;
+    let block = query.sh_width / query.blocks;
     let used = sh_used(block / 3u, view.sh_degree);
     if (all(v == vec3<f32>(0.0)) || used == 0u) {
         return;
@@ -92,10 +91,10 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     var basis = sh_basis(unit);
     var slopes = sh_basis_gradient(unit);
     var d_unit = vec3<f32>(0.0);
-    for (var b = 0u; b < ask.blocks; b++) {
+    for (var b = 0u; b < query.blocks; b++) {
         var d_weight = 0.0;
         for (var k = 0u; k < used; k++) {
-            let i = at(row, b * block + 3u * k, ask.sh_width);
+            let i = at(row, b * block + 3u * k, query.sh_width);
             let d = weight[b] * basis[k] * v;
             d_sh[i] += d.x;
             d_sh[i + 16u] += d.y;
@@ -104,8 +103,8 @@ fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
             d_weight += basis[k] * light;
             d_unit += weight[b] * light * slopes[k];
         }
-        if (ask.blocks > 1u) {
-            weights[at(row, b, ask.blocks)] = d_weight;
+        if (query.blocks > 1u) {
+            weights[at(row, b, query.blocks)] = d_weight;
         }
     }
     if (used > 1u) {

@@ -1,7 +1,7 @@
 // Gathers the visible splats, in the order of their numbers, as pairs (depth bits, number): sorted stably by the key
 // they are in the order (depth, number) that render/bin.rs defines. Depths are positive, so their bits sort as they do.
 //
-// Bindings, group 0: 0 counts ([0]: splats); 1 marks (1: visible), 2 places (exclusive sums of marks), 3 colors (depth
+// Bindings, group 0: 0 counts ([0]: splats); 1 marks (1: visible), 2 indices (exclusive sums of marks), 3 colors (depth
 // in w); out: 4 keys, 5 values. Six storage buffers. A thread owns one splat.
 
 @group(0) @binding(0) var<storage, read> counts: array<u32>;

@@ -1,4 +1,4 @@
-//! An image that never leaves the GPU: drawn, compared with its truth and taken back in one submission.
+//! An image that never leaves the GPU: rendered, compared with its truth and backpropagated in one submission.
 
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
@@ -50,7 +50,7 @@ fn window() -> [f32; 12] {
 }
 
 impl Loss {
-    /// `dssim`: λ. `response`: number of the camera's row, where it does not show what is drawn.
+    /// `dssim`: λ. `response`: number of the camera's row, where it does not show what is rendered.
     pub(super) fn new(dssim: f64, held: &Held, response: Option<usize>) -> Self {
         let total = held.weight * CHANNELS as f64;
         Self {
@@ -73,7 +73,7 @@ pub(super) fn means(held: &Held, [l1, ssim, mse]: [f64; 3], d_response: Option<[
 }
 
 impl GpuRenderer {
-    /// Whether an image of so many splats can be compared at all: its planes are in one piece.
+    /// Whether an image of this many splats can be compared at all: its planes are one buffer.
     pub(super) fn can_compare(&self, splats: usize, [w, h]: [usize; 2]) -> bool {
         let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
         let whole = Band { first: 0, rows: h.div_ceil(TILE) };
@@ -111,7 +111,7 @@ impl GpuRenderer {
         Ok(Some(comparison))
     }
 
-    /// Renders, compares and runs the backward pass. `None`: it must be drawn in bands.
+    /// Renders, compares and runs the backward pass. `None`: it must be rendered in bands.
     fn compare_held(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -165,7 +165,7 @@ impl GpuRenderer {
         self.gpu.queue.write_buffer(self.buffers.uniforms.get(), at, bytemuck::bytes_of(loss));
     }
 
-    /// Buffers of the loss of an image, of which so many numbers come.
+    /// Buffers of the loss of an image, which returns this many numbers.
     pub(super) fn make_room_for_loss(&mut self, [w, h]: [usize; 2], partials: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         b.maps.ensure(gpu, (4 * CHANNELS * MAPS * w * h) as u64)?;
@@ -173,7 +173,7 @@ impl GpuRenderer {
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
-    /// One submission: rendering, comparison, backward pass. What came means nothing if there are more pairs than there is room for.
+    /// One submission: rendering, comparison, backward pass. The results are invalid if there are more pairs than fit.
     fn there_and_back(
         &mut self,
         held: &Held,
@@ -197,7 +197,7 @@ impl GpuRenderer {
     }
 }
 
-/// Number of the first sum behind records of so many pairs.
+/// Number of the first sum behind records of this many pairs.
 pub(super) fn sums_at(room: usize) -> u32 {
     (RECORD_BYTES / 4) as u32 * room as u32
 }

@@ -1,6 +1,7 @@
-// A copy, sixteen bytes at a time: how many bytes a second kernels can read and write.
+// A copy, sixteen bytes at a time: how many bytes per second kernels can read and write.
 //
-// Bindings, group 0: 0 from; out: 1 to, as long as `from`. Two storage buffers. A thread owns COPY_EACH vectors, THREADS apart.
+// Bindings, group 0: 0 from; out: 1 to, as long as `from`. Two storage buffers. A thread owns COPY_EACH vectors,
+// THREADS apart.
 
 const THREADS: u32 = 256u;
 const COPY_EACH: u32 = 4u;

@@ -1,6 +1,5 @@
-//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
-//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups, where it has
-//! them.
+//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is requested, so that what runs here runs in a
+//! browser too; except for the size of buffers, which natively is the driver's limit, and subgroups, where available.
 
 use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
@@ -21,7 +20,7 @@ pub enum Adapters {
 /// Threads of the smallest and the largest subgroup that kernels can work with (rasterize_back_subgroup.wgsl).
 pub(super) const SUBGROUPS: [u32; 2] = [8, 64];
 
-/// The first error that the driver reported since it was last asked for.
+/// The first error that the driver reported since it was last requested.
 type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
 
 /// An open GPU.
@@ -31,7 +30,7 @@ pub struct Gpu {
     pub(super) queue: wgpu::Queue,
     /// Of the kernels that are compiled for it.
     pub(super) tuning: Tuning,
-    /// Buffers for which there is no memory, where tests say so.
+    /// Buffers for which there is no memory, as tests request.
     pub(super) refused: Option<&'static str>,
     info: wgpu::AdapterInfo,
     trouble: Trouble,
@@ -45,7 +44,7 @@ impl Gpu {
         Self::open_within(adapters, u64::MAX)
     }
 
-    /// The same, with no buffer larger than so many bytes, whatever the driver has.
+    /// The same, with no buffer larger than this many bytes, whatever the driver has.
     pub(super) fn open_within(adapters: Adapters, most: u64) -> Result<Self> {
         let mut found = all_adapters();
         found.retain(|a| adapters == Adapters::Any || a.get_info().device_type != wgpu::DeviceType::Cpu);
@@ -105,12 +104,12 @@ impl Gpu {
         Self { tuning, ..self }
     }
 
-    /// The card's name as its driver gives it.
+    /// The adapter's name from its driver.
     pub(crate) fn name(&self) -> &str {
         &self.info.name
     }
 
-    /// Card, kind, interface and driver in one line, and whether kernels use its subgroups.
+    /// Adapter, kind, interface and driver in one line, and whether kernels use its subgroups.
     pub fn describe(&self) -> String {
         let i = &self.info;
         let driver = [i.driver.as_str(), i.driver_info.as_str()].join(" ");
@@ -139,7 +138,7 @@ impl Gpu {
         self.poll(wgpu::PollType::wait_indefinitely())
     }
 
-    /// Waits until some work has been done, and not for what came after it.
+    /// Waits until the given work is done, and not for later work.
     pub(super) fn wait_for(&self, work: &wgpu::SubmissionIndex) -> Result<()> {
         self.poll(wgpu::PollType::Wait { submission_index: Some(work.clone()), timeout: None })
     }

@@ -40,13 +40,13 @@ pub(super) mod count {
     pub(crate) const SPLATS: usize = 0;
     pub(crate) const VISIBLE: usize = 1;
     pub(crate) const PAIRS: usize = 2;
-    /// Where steps on tables that stay have stopped (scan.wgsl, record.wgsl), and the pairs that were wanted.
+    /// Position at which resident steps stopped (scan.wgsl, record.wgsl), and the pairs that were needed.
     pub(crate) const STOP: usize = 3;
     pub(crate) const ALL: usize = 5;
 }
 
-/// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup a
-/// block of things.
+/// The two buffers of arguments, and what is in each: triples of u32, first for one thread per item, then for one
+/// workgroup per block of items.
 pub(super) mod arguments {
     pub(crate) const VISIBLE: usize = 0;
     pub(crate) const PAIRS: usize = 1;
@@ -55,7 +55,7 @@ pub(super) mod arguments {
     pub(crate) const BYTES: u64 = 24;
 }
 
-/// Rows of tiles that are drawn at once.
+/// Rows of tiles that are rendered at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Band {
     /// First row of tiles.
@@ -174,7 +174,7 @@ impl Groups {
 }
 
 /// Number of workgroups of a dispatch: known here, or written by an earlier kernel, in this buffer of sizes and at this
-/// place.
+/// position.
 #[derive(Clone, Copy)]
 enum Size {
     Known(usize),
@@ -258,8 +258,8 @@ impl Frame<'_> {
         })
     }
 
-    /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the sorted
-    /// pairs lie.
+    /// Lists and blends one band; `bytes`: this many pixels of it in 8 bits too. Returns in which of the two buffers
+    /// the sorted pairs are.
     pub(super) fn band(
         &self,
         recorder: &mut Recorder<'_>,
@@ -301,7 +301,7 @@ impl Frame<'_> {
     }
 }
 
-/// What the backward pass of a frame runs over.
+/// Range of a frame's backward pass.
 #[derive(Clone, Copy)]
 pub(super) struct Back<'a> {
     /// The frame before.

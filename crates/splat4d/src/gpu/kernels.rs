@@ -280,7 +280,7 @@ impl ResidentKernels {
 const BACK_THREADS: usize = 64;
 const BACK_SPLATS: usize = 16;
 
-/// The blend's backward pass that this device and its tuning want.
+/// The blend's backward pass for this device and its tuning.
 fn rasterize_back(gpu: &Gpu) -> String {
     match (gpu.has_subgroups(), gpu.tuning.back_vectors) {
         (false, _) => wgsl::RASTERIZE_BACK.into(),

@@ -1,8 +1,8 @@
-// Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and its VJP),
-// motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
+// Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and
+// its VJP), motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
 //
-// No bindings and no entry point, but for `params`, which whoever includes this binds: all tables of a layer but the SH, one
-// after the other, [row / 16][column][16].
+// No bindings and no entry point, but for `params`, which the including shader binds: all tables of a layer but the
+// SH, one after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
 // Threads of a workgroup of the kernels over rows (gpu/tuning.rs).
@@ -11,11 +11,12 @@ const ROW_THREADS: u32 = 256u;
 const QUAT: u32 = 3u;
 const LOG_SCALE: u32 = 7u;
 const OPACITY: u32 = 10u;
-// Bits of ask.flags: quaternions have rates; the life's centre learns from opacity alone; this is the step's first view.
-const ASK_ROTATION: u32 = 1u;
-const ASK_DETACH: u32 = 2u;
-const ASK_FIRST: u32 = 4u;
-// Kinds of life.
+// Bits of query.flags: quaternions have rates; the lifespan's centre learns from opacity alone; this is the step's
+// first view.
+const QUERY_ROTATION: u32 = 1u;
+const QUERY_DETACH: u32 = 2u;
+const QUERY_FIRST: u32 = 4u;
+// Kinds of lifespan.
 const LIFE_INFINITE: u32 = 0u;
 const LIFE_HALF: u32 = 1u;
 const LIFE_ONE: u32 = 2u;
@@ -23,7 +24,7 @@ const LIFE_INTERVAL: u32 = 3u;
 // A quaternion shorter than this is the identity (math/quat.rs).
 const TINY_NORM: f32 = 1e-12;
 
-struct Ask {
+struct Query {
     rows: u32,
     width: u32,         // columns of params
     order: u32,         // of the polynomial
@@ -33,7 +34,7 @@ struct Ask {
     velocities_at: u32,
     rates_at: u32,
     t: f32,
-    delta: f32,         // of rows that live for ever
+    delta: f32,         // of rows that have infinite lifespans
     alpha_min: f32,     // least opacity of a row that is alive
     widest: f32,        // widths from the centre at which no row is
     first_splat: u32,
@@ -41,7 +42,7 @@ struct Ask {
     sh_width: u32,
     blocks: u32,        // of spherical harmonics
     poses_at: u32,      // mean and quaternion: 0, or where the poses of a tracked frame are
-    own_at: u32,        // what Gaussians of space and time have besides (slice.wgsl), and their numbers
+    own_at: u32,        // further columns of Gaussians of space and time (slice.wgsl), and their numbers
     speed: f32,
     floor: f32,
     ceiling: f32,
@@ -63,59 +64,59 @@ fn sigmoid(x: f32) -> f32 {
     return 1.0 / (1.0 + exp(-x));
 }
 
-fn three(ask: Ask, row: u32, column: u32) -> vec3<f32> {
-    let i = at(row, column, ask.width);
+fn three(query: Query, row: u32, column: u32) -> vec3<f32> {
+    let i = at(row, column, query.width);
     return vec3<f32>(params[i], params[i + TABLE_BLOCK], params[i + 2u * TABLE_BLOCK]);
 }
 
-fn four(ask: Ask, row: u32, column: u32) -> vec4<f32> {
-    return vec4<f32>(three(ask, row, column), params[at(row, column + 3u, ask.width)]);
+fn four(query: Query, row: u32, column: u32) -> vec4<f32> {
+    return vec4<f32>(three(query, row, column), params[at(row, column + 3u, query.width)]);
 }
 
-fn delta_of(ask: Ask, row: u32) -> f32 {
-    if (ask.life == LIFE_INFINITE) {
-        return ask.delta;
+fn delta_of(query: Query, row: u32) -> f32 {
+    if (query.life == LIFE_INFINITE) {
+        return query.delta;
     }
-    return ask.t - params[at(row, ask.life_at, ask.width)];
+    return query.t - params[at(row, query.life_at, query.width)];
 }
 
-fn moved(ask: Ask, row: u32, delta: f32) -> Moved {
+fn moved(query: Query, row: u32, delta: f32) -> Moved {
     var out: Moved;
-    out.mean = three(ask, row, ask.poses_at);
-    out.quat = four(ask, row, ask.poses_at + QUAT);
-    out.log_scale = three(ask, row, LOG_SCALE);
-    out.logit = params[at(row, OPACITY, ask.width)];
+    out.mean = three(query, row, query.poses_at);
+    out.quat = four(query, row, query.poses_at + QUAT);
+    out.log_scale = three(query, row, LOG_SCALE);
+    out.logit = params[at(row, OPACITY, query.width)];
     var power = 1.0;
-    for (var k = 0u; k < ask.order; k++) {
+    for (var k = 0u; k < query.order; k++) {
         power *= delta;
-        out.mean += power * three(ask, row, ask.velocities_at + 3u * k);
+        out.mean += power * three(query, row, query.velocities_at + 3u * k);
     }
-    if ((ask.flags & ASK_ROTATION) != 0u) {
-        out.quat += delta * four(ask, row, ask.rates_at);
+    if ((query.flags & QUERY_ROTATION) != 0u) {
+        out.quat += delta * four(query, row, query.rates_at);
     }
     return out;
 }
 
 // The envelope, and its derivatives to time, log width and log softness.
-fn life_of(ask: Ask, row: u32) -> vec4<f32> {
-    if (ask.life == LIFE_INFINITE) {
+fn life_of(query: Query, row: u32) -> vec4<f32> {
+    if (query.life == LIFE_INFINITE) {
         return vec4<f32>(1.0, 0.0, 0.0, 0.0);
     }
-    let delta = delta_of(ask, row);
-    let log_width = params[at(row, ask.life_at + 1u, ask.width)];
-    if (ask.life == LIFE_INTERVAL) {
+    let delta = delta_of(query, row);
+    let log_width = params[at(row, query.life_at + 1u, query.width)];
+    if (query.life == LIFE_INTERVAL) {
         let width = exp(log_width);
         let over = abs(delta) - width;
         if (over <= 0.0) {
             return vec4<f32>(1.0, 0.0, 0.0, 0.0);
         }
-        let inverse = exp(-params[at(row, ask.life_at + 2u, ask.width)]);
+        let inverse = exp(-params[at(row, query.life_at + 2u, query.width)]);
         let e = over * inverse;
         let sigma = exp(-0.5 * e * e);
         let slope = sigma * e * inverse;
         return vec4<f32>(sigma, select(-slope, slope, delta < 0.0), slope * width, sigma * e * e);
     }
-    let half = select(1.0, 0.5, ask.life == LIFE_HALF);
+    let half = select(1.0, 0.5, query.life == LIFE_HALF);
     let inverse = exp(-log_width);
     let u = delta * inverse;
     let sigma = exp(-half * u * u);

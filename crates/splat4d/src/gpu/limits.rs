@@ -7,7 +7,7 @@ pub(super) const THREADS: usize = 256;
 /// Columns of the geometry that splats are made of: mean, covariance, opacity.
 pub(super) const GEOMETRY_WIDTH: usize = 10;
 
-/// Bytes of a layer's geometry as it is drawn.
+/// Bytes of a layer's geometry for rendering.
 pub(super) fn geometry_bytes(rows: usize) -> u64 {
     (4 * GEOMETRY_WIDTH * rows.next_multiple_of(BLOCK)) as u64
 }

@@ -1,14 +1,14 @@
-// The picture loss of 3DGS, (1 - lambda) L1 + lambda (1 - SSIM), and its gradient. Twin of splat4d-train's loss/kernel.rs,
-// where the equations stand, and, for the cameras' colour matrices, of learner/exposure.rs.
+// The image loss of 3DGS, (1 - lambda) L1 + lambda (1 - SSIM), and its gradient. Twin of splat4d-train's
+// loss/kernel.rs, which documents the equations, and, for the cameras' colour matrices, of learner/exposure.rs.
 //
-// Two dispatches, a workgroup a tile of 16 x 16 pixels: `moments` writes the derivatives of SSIM to the local moments, and
-// what the tile adds to the value; `gradient` blurs these derivatives and writes the gradient to the drawn picture.
-// Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for red, green, blue
-// and weight, or three planes of f32, behind which is a plane of weights where pixels have some that are not of 8 bits; 3 maps:
-// nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials: sixteen numbers a tile, |error|, SSIM and
-// squared error with weights, one unused, the twelve of the camera's matrix and offsets; 6 responses: those twelve, a camera after
-// the other, without the identity. Six storage buffers, 14.5 KiB of workgroup memory.
-// A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
+// Two dispatches, a workgroup a tile of 16 x 16 pixels: `moments` writes the derivatives of SSIM to the local moments,
+// and what the tile adds to the value; `gradient` blurs these derivatives and writes the gradient to the rendered
+// image. Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for
+// red, green, blue and weight, or three planes of f32, behind which is a plane of weights where pixels have some that
+// are not of 8 bits; 3 maps: nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials:
+// sixteen numbers per tile, |error|, SSIM and squared error with weights, one unused, the twelve of the camera's matrix
+// and offsets; 6 responses: those twelve, a camera after the other, without the identity. Six storage buffers, 14.5 KiB
+// of workgroup memory. A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
 
 const TILE: u32 = 16u;
 const THREADS: u32 = 256u;
@@ -46,7 +46,7 @@ struct Loss {
 @group(0) @binding(5) var<storage, read_write> partials: array<f32>;
 @group(0) @binding(6) var<storage, read> responses: array<f32>;
 
-// Of `moments` the picture and the truth, of `gradient` three maps.
+// Of `moments` the image and the truth, of `gradient` three maps.
 var<workgroup> wide: array<array<f32, 676>, 3>;
 // Means along rows; then sums of a tile.
 var<workgroup> narrow: array<vec4<f32>, 416>;
@@ -94,7 +94,7 @@ fn shown_of(at: u32, channel: u32) -> f32 {
     return drawn[channel] + dot(row.xyz, drawn) + row.w;
 }
 
-// Number of the i-th pixel of a tile with its halo; 0xffffffff outside of the picture.
+// Number of the i-th pixel of a tile with its halo; 0xffffffff outside of the image.
 fn pixel_of(tile: vec2<u32>, i: u32) -> u32 {
     // Negative numbers wrap to large ones.
     let x = tile.x * TILE + i % WIDE - REACH;

@@ -35,8 +35,8 @@ pub use tuning::Tuning;
 
 use crate::render::backend::refusal;
 use crate::render::{
-    Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables, Target,
-    Wanted,
+    Abilities, Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables,
+    Target,
 };
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
@@ -60,7 +60,7 @@ const OWNER_SHIFT: u32 = 28;
 const FLAG_ANTIALIAS: u32 = 1;
 /// Pairs of tile and splat that are held at once (a quarter GiB); bands are made so that no more are needed.
 const MOST_PAIRS: usize = 1 << 24;
-/// Pairs that there is room for at first, for each splat and at least.
+/// Initial capacity for pairs, per splat and at least.
 const FIRST_PAIRS: (usize, usize) = (4, 1 << 16);
 /// Workgroups of one dispatch in one direction (WebGPU's default limit).
 const MOST_GROUPS: usize = 65_535;
@@ -74,11 +74,11 @@ pub struct GpuStats {
     pub visible: usize,
     /// Pairs of 16² tile and splat.
     pub pairs: usize,
-    /// Bands in which the image was drawn.
+    /// Bands in which the image was rendered.
     pub bands: usize,
 }
 
-/// Draws splats on a GPU. All memory is reused from call to call.
+/// Renders splats on a GPU. All memory is reused from call to call.
 #[derive(Debug)]
 pub struct GpuRenderer {
     /// Options; `simd` means nothing here.
@@ -104,11 +104,12 @@ pub struct GpuRenderer {
     drawn: Vec<(Band, usize)>,
     returned: Returned,
     pictures: Pictures,
-    /// How a camera shows what is drawn, where no tables stay.
+    /// How a camera shows what is rendered, where no tables stay.
     response: Grown,
     resident: Option<Box<KeptTables>>,
     flights: Flights,
-    /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests say so.
+    /// Steps that may be in flight, rows of tiles of a band in them, and rows of a page of their tables, where tests
+    /// request it.
     ahead: usize,
     band_rows: usize,
     page_rows: Option<usize>,
@@ -170,12 +171,12 @@ impl GpuRenderer {
     }
 
     /// Refuses what the shaders cannot do, without opening a GPU.
-    pub(crate) fn refuses(wanted: &Wanted) -> Result<()> {
-        let lacks = [(wanted.head, "draw scenes with a pixel head"), (wanted.extra, "blend further channels")];
-        lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
+    pub(crate) fn refuses(abilities: &Abilities) -> Result<()> {
+        let lacks = [(abilities.head, "render scenes with a pixel head"), (abilities.extra, "blend further channels")];
+        lacks.iter().find(|(abilities, _)| *abilities).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 
-    /// Draws all bands of an image that has pixels.
+    /// Renders all bands of an image that has pixels.
     fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Out<'_>) -> Result<()> {
         let start = Instant::now();
         let (n, w, h) = (self.stats.splats, shot.camera.width, shot.camera.height);
@@ -221,7 +222,7 @@ impl GpuRenderer {
                 self.drawn.push((band, pairs));
                 continue;
             }
-            // Too many pairs for the room there is: more room, or two halves.
+            // Too many pairs for the buffers: larger ones, or two halves.
             if pairs <= self.most_pairs {
                 fresh |= self.make_room_for_pairs(pairs)?;
                 bands.push(band);
@@ -241,7 +242,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Buffers with a row a splat; whether any is new.
+    /// Buffers with a row per splat; whether any is new.
     fn make_room_for_splats(&mut self, n: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let n = n as u64;
@@ -291,7 +292,7 @@ impl GpuRenderer {
         Ok(fresh)
     }
 
-    /// Pairs that there is room for.
+    /// Capacity for pairs.
     fn pair_capacity(&self) -> usize {
         (self.buffers.pair_keys[0].bytes() / 4) as usize
     }
@@ -388,13 +389,13 @@ impl GpuRenderer {
 }
 
 impl Backend<f32> for GpuRenderer {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        Self::refuses(wanted)
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        Self::refuses(abilities)
     }
 
     /// Errors in addition to those of every backend: the scene or the image is too large for WebGPU's limits.
     fn render(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
-        self.can(&shot.wanted())?;
+        self.can(&shot.abilities())?;
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
         self.timings = GpuTimings::default();
         self.stats = GpuStats { splats: n, ..GpuStats::default() };
@@ -407,7 +408,7 @@ impl Backend<f32> for GpuRenderer {
     }
 
     fn render_bytes(&mut self, shot: &Shot<'_, f32>, out: &mut Vec<[u8; 4]>) -> Result<bool> {
-        self.can(&shot.wanted())?;
+        self.can(&shot.abilities())?;
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
         self.timings = GpuTimings::default();
         self.stats = GpuStats { splats: n, ..GpuStats::default() };
@@ -427,13 +428,12 @@ impl Backend<f32> for GpuRenderer {
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..shot.wanted() })?;
-        self.take_back(shot, grads, d_sh, d)
+        self.can(&Abilities { backward: true, ..shot.abilities() })?;
+        self.backward_band(shot, grads, d_sh, d)
     }
 
-    /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be drawn in bands, or
-    /// none of its pixels
-    /// counts.
+    /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be rendered in bands, or
+    /// none of its pixels counts.
     fn compare(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -441,7 +441,7 @@ impl Backend<f32> for GpuRenderer {
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) -> Result<Option<Comparison>> {
-        self.can(&Wanted { backward: true, ..shot.wanted() })?;
+        self.can(&Abilities { backward: true, ..shot.abilities() })?;
         if shot.depth { Ok(None) } else { self.compare_here(shot, target, d_sh, d) }
     }
 
@@ -462,10 +462,10 @@ impl Backend<f32> for GpuRenderer {
     }
 }
 
-/// What a submission does in addition to drawing a band.
+/// Work of a submission in addition to rendering a band.
 #[derive(Clone, Copy, Debug, Default)]
 struct Way {
-    /// Of the backward pass, flags and place of the sums in `Blend`.
+    /// Of the backward pass, flags and position of the sums in `Blend`.
     flags: u32,
     sums_at: u32,
     /// Whether records are added to those of earlier bands.
@@ -476,14 +476,14 @@ struct Way {
     view: u32,
 }
 
-/// Where an image goes.
+/// Destination of an image.
 enum Out<'a> {
     Planes(&'a mut Image<f32>),
     /// Red, green, blue, alpha of every pixel.
     Bytes(&'a mut [[u8; 4]]),
 }
 
-/// Copies the planes of a band into the image, from pixel row `first` on; the depth only where it is drawn.
+/// Copies the planes of a band into the image, from pixel row `first` on; the depth only where it is rendered.
 fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
     let width = out.alpha.width;
     let Image { color, alpha, depth, .. } = out;
@@ -512,7 +512,7 @@ fn counts_at(planes: u64) -> u64 {
     planes.next_multiple_of(UNIFORM_STRIDE)
 }
 
-/// Bytes of the sort's counts for so many pairs.
+/// Bytes of the sort's counts for this many pairs.
 fn sort_bytes(gpu: &Gpu, pairs: u64) -> u64 {
     4 * DIGITS as u64 * (pairs.div_ceil(gpu.tuning.block() as u64) + 1)
 }

@@ -36,7 +36,7 @@ pub(super) struct Held {
     stays: bool,
 }
 
-/// Images by their number. What fits into the budget stays; what comes later is sent every time.
+/// Images by their number. What fits into the budget stays; later images are sent every time.
 #[derive(Debug)]
 pub(super) struct Pictures {
     kept: BTreeMap<usize, Held>,
@@ -48,7 +48,7 @@ pub(super) struct Pictures {
     /// Bytes of these and of those in use.
     passing: u64,
     words: Vec<u32>,
-    /// Images sent so far.
+    /// Number of images sent.
     pub sent: usize,
 }
 
@@ -64,7 +64,7 @@ impl Pictures {
         self.bytes + self.passing
     }
 
-    /// An image on the GPU, which is to be [given back](Self::give_back). Errors: not even this one has room.
+    /// An image on the GPU, which is to be [given back](Self::give_back). Errors: even this one does not fit.
     pub(super) fn hold(&mut self, gpu: &Gpu, target: &Target<'_, f32>) -> Result<Held> {
         let (size, weighted) = ([target.truth.width, target.truth.height], target.weight.is_some());
         match self.kept.get(&target.picture) {
@@ -105,14 +105,14 @@ impl Pictures {
         Ok(Held { buffer: buffer.get().clone(), flags, weight, size, stays: false })
     }
 
-    /// Takes back an image that is no longer compared with.
+    /// Releases an image that is no longer compared with.
     pub(super) fn give_back(&mut self, held: Held) {
         if !held.stays {
             self.spare.push(Grown::of("an image's truth", held.buffer));
         }
     }
 
-    /// Keeps half of what is kept now, for want of memory.
+    /// Keeps half of what is kept now, for lack of memory.
     pub(super) fn shrink(&mut self) {
         self.budget = self.bytes / 2;
         self.forget();
@@ -131,7 +131,7 @@ fn sample(x: f32) -> Option<u32> {
     ((0.0..=LARGEST).contains(&k) && (k / LARGEST - x).abs() <= SAME).then_some(k as u32)
 }
 
-/// An image as loss.wgsl reads it: in 8 bits where that is what its samples are, and so its weights. Returns its flags.
+/// An image as loss.wgsl reads it: in 8 bits if its samples have 8 bits, and so its weights. Returns its flags.
 fn pack(target: &Target<'_, f32>, words: &mut Vec<u32>) -> u32 {
     let (truth, pixels) = (target.truth, target.truth.pixels());
     let packed = |words: &mut Vec<u32>, weight: Option<&Planes<f32>>| {

@@ -1,10 +1,10 @@
 // Writes a row's gradients: the step's first view overwrites, the others add. After learnt.wgsl.
 //
-// No bindings and no entry point, but for `ask` and `d_params`, which whoever includes this binds.
+// No bindings and no entry point, but for `query` and `d_params`, which the including shader binds.
 
 fn put(row: u32, column: u32, d: f32) {
-    let i = at(row, column, ask.width);
-    if ((ask.flags & ASK_FIRST) != 0u) {
+    let i = at(row, column, query.width);
+    if ((query.flags & QUERY_FIRST) != 0u) {
         d_params[i] = d;
     } else {
         d_params[i] += d;

@@ -1,8 +1,8 @@
 // Where each tile's pairs begin and end in the sorted list. Twin of `starts` in render/bin.rs.
 //
-// Bindings, group 0: 0 counts ([2]: pairs); 1 keys, ascending; 2 ranges: three u32 a tile, first, one past the last and
-// (written by rasterize.wgsl) one past the last of use, cleared to 0 before. Keys past the last tile have no list. Three
-// storage buffers. A thread owns every 256th of a workgroup's 2,048 pairs.
+// Bindings, group 0: 0 counts ([2]: pairs); 1 keys, ascending; 2 ranges: three u32 per tile, first, one past the last
+// and (written by rasterize.wgsl) one past the last of use, cleared to 0 before. Keys past the last tile have no list.
+// Three storage buffers. A thread owns every 256th of a workgroup's 2,048 pairs.
 
 const RANGES_THREADS: u32 = 256u;
 const RANGES_ROUNDS: u32 = 8u;

@@ -1,16 +1,15 @@
 // Blends each tile's splats front to back to colour, alpha and depth. Twin of render/rasterize.rs (forward), where the
-// equations and their sources stand. render/project.wgsl is put in front of this file.
+// equations and their sources are documented. render/project.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile; the third is written: one past the last pair that some
-// pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
-// 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
-// [rows of the planes][width]. Six storage buffers, 12 KiB of workgroup memory.
-// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; splats are
-// read in batches by all threads together.
+// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile; the third is written: one past the last pair that
+// some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants); 5
+// shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each [rows of
+// the planes][width]. Six storage buffers, 12 KiB of workgroup memory. A workgroup owns a tile of 16 x 16 pixels, 64
+// neighbouring threads a quadrant of it, a thread per pixel; splats are read in batches by all threads together.
 
 const TILE: u32 = 16u;
 const THREADS: u32 = 256u;
-// Splats that are read at a time, at most one a thread (gpu/tuning.rs).
+// Splats that are read at a time, at most one per thread (gpu/tuning.rs).
 const BATCH: u32 = 256u;
 // Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
 const QUADRANT: u32 = 8u;
@@ -66,7 +65,7 @@ fn rasterize(
     var sum = vec4<f32>(0.0); // red, green, blue, depth
     var t = 1.0;
     var open = inside;
-    // Set here, because natively nobody clears a workgroup's memory.
+    // Set here, because native drivers do not clear a workgroup's memory.
     if (thread == 0u) {
         atomicStore(&stopped, 0u);
         atomicStore(&last_used, 0u);
@@ -80,7 +79,7 @@ fn rasterize(
         atomicAdd(&stopped, 1u);
     }
     for (var start = first; start < end; start += BATCH) {
-        // Everybody has read the last batch, and has said whether their pixel has stopped.
+        // All threads have read the last batch and reported whether their pixel has stopped.
         workgroupBarrier();
         if (thread == 0u) {
             all_stopped = atomicLoad(&stopped);

@@ -1,10 +1,11 @@
-// The way back through a tile: of each pair of tile and splat one record of twelve sums, at a place that is known
-// beforehand, so that nothing is added atomically. render/project.wgsl and blend_back.wgsl, where bindings and twin stand, are
-// put in front of this file. 16 KiB of workgroup memory; rasterize_back_subgroup.wgsl is for devices with subgroups.
+// The backward pass of a tile: of each pair of tile and splat one record of twelve sums, at a position that is known
+// beforehand, so that nothing is added atomically. render/project.wgsl and blend_back.wgsl, which document the bindings
+// and the CPU implementation, are put in front of this file. 16 KiB of workgroup memory; rasterize_back_subgroup.wgsl
+// is for devices with subgroups.
 //
-// A workgroup owns a tile and goes front to back in rounds of up to four splats: a thread owns a pixel and writes v = dL/d ln
-// alpha and the weight w = alpha T of each splat; then a thread owns a splat, a column of the tile and a quarter of the
-// sums; then a thread owns one sum of one splat, and adds the columns in order.
+// A workgroup owns a tile and goes front to back in rounds of up to four splats: a thread owns a pixel and writes v =
+// dL/d ln alpha and the weight w = alpha T of each splat; then a thread owns a splat, a column of the tile and a
+// quarter of the sums; then a thread owns one sum of one splat, and adds the columns in order.
 
 // Splats in a round, at most one for 64 threads: more need more than 16 KiB (gpu/tuning.rs).
 const ROUND: u32 = 4u;
@@ -77,7 +78,7 @@ fn rasterize_back(
     let part_of = thread / TILE % 4u;
     var t = 1.0;
     for (var start = first; start < end; start += ROUND) {
-        // Everybody has read the last round.
+        // All threads have read the last round.
         workgroupBarrier();
         if (thread < ROUND && start + thread < end) {
             let pair = values[start + thread];

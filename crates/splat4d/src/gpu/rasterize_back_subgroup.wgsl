@@ -1,5 +1,5 @@
-// The way back through a tile on devices with subgroups: the records of rasterize_back.wgsl, added up in registers and by exchanges
-// between threads. subgroup_sums.wgsl, where the rest is said, is put in front of this file.
+// The backward pass of a tile on devices with subgroups: the records of rasterize_back.wgsl, added up in registers and
+// by exchanges between threads. subgroup_sums.wgsl, where the rest is reported, is put in front of this file.
 
 @compute @workgroup_size(64)
 fn rasterize_back(
@@ -54,7 +54,7 @@ fn rasterize_back(
         records[blend.sums_at + 3u * tile + thread] = total(0u, thread, subgroups);
     }
     for (var start = first; start < end; start += SPLATS) {
-        // Everybody has read the last splats and their sums.
+        // All threads have read the last splats and their sums.
         workgroupBarrier();
         read_splats(start, end, thread);
         workgroupBarrier();

@@ -1,6 +1,7 @@
-// rasterize_back_subgroup.wgsl with a thread's four pixels in the components of vectors: nothing lies in an array, splats of which no
-// pixel of a subgroup takes anything are not added up, and more of them are read between two barriers. subgroup_sums.wgsl is put in
-// front of this file. Chosen by a sweep alone (gpu/tuning.rs): no card has measured it yet.
+// rasterize_back_subgroup.wgsl with a thread's four pixels in the components of vectors: nothing lies in an array,
+// splats of which no pixel of a subgroup takes anything are not added up, and more of them are read between two
+// barriers. subgroup_sums.wgsl is put in front of this file. Chosen by a sweep alone (gpu/tuning.rs): no card has
+// measured it yet.
 
 // Where a thread's pixels lie below its first.
 const DOWN: vec4<f32> = vec4<f32>(0.0, 1.0, 2.0, 3.0);
@@ -68,7 +69,7 @@ fn rasterize_back(
         records[blend.sums_at + 3u * tile + thread] = total(0u, thread, subgroups);
     }
     for (var start = first; start < end; start += SPLATS) {
-        // Everybody has read the last splats and their sums.
+        // All threads have read the last splats and their sums.
         workgroupBarrier();
         read_splats(start, end, thread);
         workgroupBarrier();

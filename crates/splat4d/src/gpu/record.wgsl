@@ -1,11 +1,12 @@
-// What a step on tables that stay leaves of itself: sums over the tiles of each view, the cameras' colour matrices, and the
-// record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
+// The record of a step on resident tables: sums over the tiles of each view, the cameras' colour matrices, and
+// the record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
 //
-// Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last.
-// Bindings, group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were wanted then);
-// 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other kernels; 4 responses: of every
-// camera the twelve numbers that loss.wgsl reads, then in the same order their gradients, first moments, second moments, and behind
-// them all a step count a camera and 1 for each that is held about the mean; 5 corrections of adam.wgsl. Five storage buffers.
+// Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last. Bindings,
+// group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were requested
+// then); 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other kernels; 4
+// responses: of every camera the twelve numbers that loss.wgsl reads, then in the same order their gradients, first
+// moments, second moments, and behind them all a step count a camera and 1 for each that is held about the mean; 5
+// corrections of adam.wgsl. Five storage buffers.
 
 const THREADS: u32 = 256u;
 const NUMBERS: u32 = 16u;  // of a tile
@@ -26,7 +27,7 @@ const EPSILON: f32 = 1e-15;
 struct Rule {
     tiles: u32,
     view: u32,
-    camera: u32,     // 0xffffffff: it shows what is drawn
+    camera: u32,     // 0xffffffff: it shows what is rendered
     cameras: u32,
     bad_at: u32,     // words of status that are not 0 where a number is none, and how many
     bad_words: u32,
@@ -53,7 +54,7 @@ fn view_sums(@builtin(local_invocation_index) thread: u32) {
     }
     sums[thread] = sum;
     workgroupBarrier();
-    // The view is drawn again, and what others gave must stay as it is.
+    // The view is rendered again, and what others gave must stay as it is.
     if (thread >= NUMBERS || counts[STOP] != 0u) {
         return;
     }

@@ -1,9 +1,9 @@
 //! Tables that stay on the GPU: rows become splats, splats an image, and its loss steps of Adam, without a number of
-//! them
-//! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
+//! them passing through the CPU. Densification, files and other readers of a scene fetch the tables, and hand them
+//! back.
 //!
-//! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own; every row
-//! has a thread to itself, so that pages change no bit of the tables.
+//! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own;
+//! every row has a thread to itself, so that pages change no bit of the tables.
 
 mod cameras;
 mod film;
@@ -33,17 +33,17 @@ pub(super) use flight::{AHEAD, Flights};
 use std::borrow::Cow;
 use std::ops::Range;
 use ties::Tied;
-use uniforms::{Ask, MOST_COLUMNS, RecordRule, Rule};
+use uniforms::{MOST_COLUMNS, Query, RecordRule, Rule};
 
-/// Number of the SH table; those before it lie side by side in one buffer.
+/// Number of the SH table; those before it are contiguous in one buffer.
 const SH: usize = KEPT - 1;
 /// Columns of a row's statistics.
 const STATS_WIDTH: usize = 3;
-/// Pieces in which Adam takes the widest table: three blocks of SH of degree 3.
+/// Pieces in which Adam processes the widest table: three blocks of SH of degree 3.
 const PIECES: usize = 3;
-/// Structures a page in the buffer of uniforms: what is asked, a rule a piece of a table, losses on rows, noise, ties.
+/// Structures per page in the buffer of uniforms: the query, a rule per piece of a table, losses on rows, noise, ties.
 mod at {
-    pub(super) const ASK: usize = 0;
+    pub(super) const QUERY: usize = 0;
     pub(super) const RULES: usize = 1;
     pub(super) const ROWS: usize = RULES + super::KEPT * super::PIECES;
     pub(super) const NOISE: usize = ROWS + 1;
@@ -129,7 +129,7 @@ impl ResidentBuffers {
         }
     }
 
-    /// First columns of the pieces in which Adam takes a table.
+    /// First columns of the pieces in which Adam processes a table.
     fn pieces(&self, table: usize) -> impl Iterator<Item = usize> {
         (0..self.widths[table]).step_by(MOST_COLUMNS)
     }
@@ -146,7 +146,7 @@ pub(super) struct Tables {
     layers: usize,
     /// Page after page of layer after layer.
     pages: Vec<ResidentBuffers>,
-    /// Geometry and SH of the pages, as they are drawn.
+    /// Geometry and SH of the pages, for rendering.
     upload: Upload,
     kernels: ResidentKernels,
     uniforms: Grown,
@@ -180,7 +180,7 @@ impl Tables {
         self.upload.bytes() + own + self.pages.iter().map(ResidentBuffers::bytes).sum::<u64>()
     }
 
-    /// What a step of so many views leaves in the status.
+    /// Status record of a step of this many views.
     fn status(&self, views: usize) -> Status {
         let bad = STEP_WORDS + VIEW_WORDS * views;
         let alive = bad + self.layers * KEPT;
@@ -207,16 +207,16 @@ impl Tables {
         })
     }
 
-    /// What is asked of a page.
-    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
-        self.uniform(page * at::ALL + at::ASK, size_of::<Ask>())
+    /// The query to a page.
+    fn query(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.uniform(page * at::ALL + at::QUERY, size_of::<Query>())
     }
 
     /// Rows to splats.
     fn answer(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
         let bind = |(i, page): (usize, &ResidentBuffers)| {
             let part = &upload.parts[i];
-            let mut group = vec![self.ask(i), page.params.all(), part.geometry.all(), page.alive.all()];
+            let mut group = vec![self.query(i), page.params.all(), part.geometry.all(), page.alive.all()];
             if matches!(page.moves, Moves::Sliced { .. }) {
                 group.push(part.weights.all());
             }
@@ -232,7 +232,7 @@ impl Tables {
 /// The words of a step behind those of record.wgsl.
 #[derive(Debug)]
 struct Status {
-    /// One a table: one more than the last row whose number is not finite.
+    /// One per table: one more than the last row whose number is not finite.
     bad: usize,
     /// Rows alive, by layer.
     alive: usize,
@@ -255,7 +255,7 @@ fn side_by_side(tables: &[(&[f32], usize)]) -> Vec<f32> {
     out
 }
 
-/// The rows of a page, of whole blocks, of a table with so many columns.
+/// The rows of a page, of whole blocks, of a table with this many columns.
 fn cut<'a>(data: &'a [f32], width: usize, page: &Range<usize>) -> &'a [f32] {
     &data[page.start * width..page.end * width]
 }
@@ -269,7 +269,7 @@ fn history<'a>(table: &ResidentTable<'a>, page: &Range<usize>) -> Cow<'a, [f32]>
     }
 }
 
-/// The other way round: some columns of tables that lie side by side.
+/// The inverse: some columns of contiguous tables.
 fn apart(all: &[f32], stride: usize, columns: Range<usize>) -> Vec<f32> {
     all.chunks_exact(stride.max(1) * BLOCK)
         .flat_map(|block| &block[columns.start * BLOCK..columns.end * BLOCK])
@@ -297,12 +297,12 @@ impl ResidentPass<'_> {
         self.view + 1 == self.step.views.len()
     }
 
-    /// Whether losses look at rows.
+    /// Whether there are losses on rows.
     fn has_row_losses(&self) -> bool {
         self.step.rows != RowWeights::default()
     }
 
-    /// Writes what is asked and by which rules is learnt, of an image of so many tiles.
+    /// Writes queries and rules of learning, for an image of this many tiles.
     fn write_uniforms(&self, gpu: &Gpu, tiles: usize) {
         let Self { tables, step, view } = *self;
         let status = tables.status(step.views.len());
@@ -312,8 +312,8 @@ impl ResidentPass<'_> {
         let mut first_splat = 0;
         for (i, page) in tables.pages.iter().enumerate() {
             let slot = |at: usize| i * at::ALL + at;
-            let ask = Ask::new(page, step.views[view].t, view == 0, step.alpha_min, first_splat);
-            put(slot(at::ASK), bytemuck::bytes_of(&ask));
+            let query = Query::new(page, step.views[view].t, view == 0, step.alpha_min, first_splat);
+            put(slot(at::QUERY), bytemuck::bytes_of(&query));
             first_splat += page.rows;
             for (table, rule) in step.rules[page.layer].iter().enumerate() {
                 let Some(rule) = rule else { continue };
@@ -355,12 +355,13 @@ impl ResidentPass<'_> {
         self.tables.uniform(at, size)
     }
 
-    /// What is asked of a page.
-    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
-        self.tables.ask(page)
+    /// The query to a page.
+    fn query(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.tables.query(page)
     }
 
-    /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the record.
+    /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the
+    /// record.
     fn learn(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
         let Tables { pages, kernels: k, status, corrections, cameras, .. } = self.tables;
         let words = status.all();
@@ -376,7 +377,7 @@ impl ResidentPass<'_> {
             let view = super::frame::uniform(b, slot::VIEW, super::frame::VIEW_BYTES);
             let colors = [
                 view,
-                self.ask(i),
+                self.query(i),
                 b.counts.all(),
                 part.geometry.all(),
                 part.tables[0].all(),
@@ -386,7 +387,7 @@ impl ResidentPass<'_> {
                 part.weights.all(),
             ];
             runs.push(Run::new(gpu, &k.colors_back, 0, &colors, layer.row_groups(gpu)));
-            let mut rows = vec![self.ask(i), b.counts.all(), layer.params.all(), b.back.all()];
+            let mut rows = vec![self.query(i), b.counts.all(), layer.params.all(), b.back.all()];
             if matches!(layer.moves, Moves::Sliced { .. }) {
                 rows.push(part.weights.all());
             }
@@ -405,7 +406,7 @@ impl ResidentPass<'_> {
             self.adam(gpu, b, upload, (i, layer), &words, &mut runs);
             if self.step.noise[layer.layer].is_some() {
                 let noise = self.uniform(i * at::ALL + at::NOISE, size_of::<uniforms::Noise>());
-                let group = [self.ask(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
+                let group = [self.query(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
                 runs.push(Run::new(gpu, &k.shake, 0, &group, layer.row_groups(gpu)));
             }
         }
@@ -416,7 +417,7 @@ impl ResidentPass<'_> {
         recorder.stage(Stage::Adam, |pass| runs.iter().for_each(|run| run.record(pass)))
     }
 
-    /// Losses that look at rows, which add to their gradients.
+    /// Losses on rows, which add to their gradients.
     fn losses(&self, gpu: &Gpu, b: &Buffers, words: &wgpu::BindingResource<'_>, runs: &mut Vec<Run>) {
         let (k, pages) = (&self.tables.kernels, &self.tables.pages);
         if self.has_row_losses() {
@@ -425,7 +426,7 @@ impl ResidentPass<'_> {
                 for (i, layer) in pages.iter().enumerate() {
                     let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
                     let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
-                    let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
+                    let group = [self.query(i), rule, b.counts.all(), params, alive, d, words.clone()];
                     runs.push(Run::new(gpu, &k.row_losses, entry, &group, layer.groups()));
                 }
             }
@@ -435,7 +436,7 @@ impl ResidentPass<'_> {
             let rule = self.uniform(i * at::ALL + at::TIES, size_of::<uniforms::TieRule>());
             let [before, edges, links, turns] = ties.buffers();
             let (params, d) = (layer.params.all(), layer.d_params.all());
-            let group = [self.ask(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
+            let group = [self.query(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
             runs.extend([0, 1].map(|entry| Run::new(gpu, &k.ties, entry, &group, ties.groups())));
         }
     }
@@ -652,7 +653,7 @@ impl GpuRenderer {
     }
 }
 
-/// Rows of a page of a layer: whole blocks, as many as every one of its buffers has room for.
+/// Rows of a page of a layer: whole blocks, as many as fit into each of its buffers.
 fn page_rows(gpu: &Gpu, layer: &ResidentLayer<'_>) -> usize {
     let small = layer.tables[..SH].iter();
     let [params, moments] = small.fold([0, 0], |[p, m], t| [p + t.width, m + moments_width(t.width)]);

@@ -1,4 +1,4 @@
-//! What a GPU could do at best, measured: the numbers that the speed of a stage is a share of.
+//! Measured upper bounds of a GPU's throughput, for the lower bounds of stage times.
 
 use super::buffers::Grown;
 use super::kernels::{Kernel, Kind};
@@ -9,7 +9,7 @@ use wgpu::BufferUsages as Usage;
 
 /// Splats that pass a thread's pixel (roofline.wgsl).
 const SPLATS: usize = 1024;
-/// A measurement is made longer until it takes so many seconds: then a submission costs next to nothing.
+/// A measurement is made longer until it takes this many seconds: then a submission costs next to nothing.
 const LONG: f64 = 0.03;
 /// Runs of which the best counts.
 const RUNS: usize = 4;
@@ -29,20 +29,21 @@ const QUADRANT_PIXELS: u64 = 64;
 pub struct GpuRoofline {
     /// Pairs of pixel and Gaussian a second.
     pub pairs: f64,
-    /// Bytes a second, read and written.
+    /// Bytes per second, read and written.
     pub bytes: f64,
-    /// Bytes a second from the CPU's memory, and to it.
+    /// Bytes per second from the CPU's memory, and to it.
     pub bus: [f64; 2],
 }
 
 impl GpuRenderer {
-    /// Measures the blend's arithmetic alone, and copies in the GPU's memory. Errors: no memory for it, or a driver that failed.
+    /// Measures the blend's arithmetic alone, and copies in the GPU's memory. Errors: no memory for it, or a driver
+    /// that failed.
     pub fn roofline(&self) -> Result<GpuRoofline> {
         Ok(GpuRoofline { pairs: self.pairs_a_second()?, bytes: self.bytes_a_second()?, bus: self.bus()? })
     }
 
-    /// Pairs of pixel and Gaussian in the lists of the last render: those of every pixel of a quadrant that a Gaussian may
-    /// touch, at most; of the last band alone, where there are several. Errors: a driver that failed.
+    /// Pairs of pixel and Gaussian in the lists of the last render: those of every pixel of a quadrant that a Gaussian
+    /// may touch, at most; of the last band alone, where there are several. Errors: a driver that failed.
     pub fn evaluations(&self) -> Result<u64> {
         let owners: Vec<u32> = self.read_back(&self.buffers.owners, self.drawn.last().map_or(0, |d| d.1))?;
         Ok(owners.iter().map(|owner| QUADRANT_PIXELS * u64::from((owner >> OWNER_SHIFT).count_ones())).sum())
@@ -99,7 +100,7 @@ impl GpuRenderer {
         Ok(groups * (THREADS * SPLATS) as f64)
     }
 
-    /// Bytes a second that come up, and go down: as tables are sent and images are read.
+    /// Bytes per second of uploads and downloads: tables are sent and images are read.
     fn bus(&self) -> Result<[f64; 2]> {
         let data = vec![1u8; BUS as usize];
         let mut on_gpu = Grown::storage("a copy's target");

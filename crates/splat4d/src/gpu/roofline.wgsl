@@ -1,6 +1,7 @@
 // The arithmetic of the blend alone, from registers: no list is read, no tile changes. Twin of render/roofline.rs.
 //
-// Bindings, group 0: 0 out, a number a thread. One storage buffer. A thread owns a pixel that ROOFLINE_SPLATS splats pass.
+// Bindings, group 0: 0 out, a number per thread. One storage buffer. A thread owns a pixel that ROOFLINE_SPLATS splats
+// pass.
 
 const ROOFLINE_SPLATS: u32 = 1024u;
 

@@ -1,10 +1,11 @@
-// Losses on the geometry of the rows that are alive, each a mean over them: opacity, its entropy, scale. Twin of MeanOpacity,
-// OpacityEntropy and MeanScale in splat4d-train's loss/scene.rs; learnt.wgsl and numbers.wgsl are put in front of this file.
+// Losses on the geometry of the rows that are alive, each a mean over them: opacity, its entropy, scale. Twin of
+// MeanOpacity, OpacityEntropy and MeanScale in splat4d-train's loss/scene.rs; learnt.wgsl and numbers.wgsl are put in
+// front of this file.
 //
-// Bindings, group 0: 0 ask; 1 rule; 2 counts ([3]: stopped); 3 params; 4 alive, as answer.wgsl left it; in and out: 5 d_params, which
-// is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the loss of each workgroup's
-// rows, as bits. Five storage buffers.
-// A thread owns one row; the rows of a workgroup are added in a fixed order.
+// Bindings, group 0: 0 query; 1 rule; 2 counts ([3]: stopped); 3 params; 4 alive, as answer.wgsl left it; in and out: 5
+// d_params, which is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the
+// loss of each workgroup's rows, as bits. Five storage buffers. A thread owns one row; the rows of a workgroup are
+// added in a fixed order.
 
 // Probabilities are kept this far from 0 and 1 (loss/image/entropy.rs).
 const MARGIN: f32 = 1e-4;
@@ -18,7 +19,7 @@ struct RowRule {
     sums_at: u32,
 }
 
-@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(0) var<uniform> query: Query;
 @group(0) @binding(1) var<uniform> rule: RowRule;
 @group(0) @binding(2) var<storage, read> counts: array<u32>;
 @group(0) @binding(3) var<storage, read> params: array<f32>;
@@ -29,9 +30,9 @@ struct RowRule {
 var<workgroup> marks: array<u32, 256>;
 var<workgroup> sums: array<f32, 256>;
 
-// None where steps have stopped: the view is drawn again, and what other views gave must stay as it is.
+// None where steps have stopped: the view is rendered again, and what other views gave must stay as it is.
 fn lives(row: u32) -> bool {
-    return counts[3] == 0u && row < ask.rows && alive[min(row, ask.rows - 1u)] != 0u;
+    return counts[3] == 0u && row < query.rows && alive[min(row, query.rows - 1u)] != 0u;
 }
 
 @compute @workgroup_size(256)
@@ -58,18 +59,18 @@ fn row_losses(
     var sum = 0.0;
     if (lives(row)) {
         let share = 1.0 / f32(max(atomicLoad(&status[rule.count_at]), 1u));
-        let o = sigmoid(params[at(row, OPACITY, ask.width)]);
+        let o = sigmoid(params[at(row, OPACITY, query.width)]);
         let held = clamp(o, MARGIN, 1.0 - MARGIN);
         let entropy = -held * ln(held) - (1.0 - held) * ln(1.0 - held);
         var slope = rule.opacity;
         if (held == o) {
             slope += rule.entropy * ln((1.0 - o) / o);
         }
-        let s = exp(three(ask, row, LOG_SCALE)) / 3.0;
+        let s = exp(three(query, row, LOG_SCALE)) / 3.0;
         sum = share * (rule.opacity * o + rule.entropy * entropy + rule.scale * (s.x + s.y + s.z));
-        d_params[at(row, OPACITY, ask.width)] += share * slope * o * (1.0 - o);
+        d_params[at(row, OPACITY, query.width)] += share * slope * o * (1.0 - o);
         for (var k = 0u; k < 3u; k++) {
-            d_params[at(row, LOG_SCALE + k, ask.width)] += share * rule.scale * s[k];
+            d_params[at(row, LOG_SCALE + k, query.width)] += share * rule.scale * s[k];
         }
     }
     sums[thread] = sum;

@@ -1,12 +1,12 @@
 // Exclusive sums of u32, and what follows from their total: how many workgroups later dispatches need. Twin of the
-// running sums in render/bin.rs. Sums stop at 2^32 - 1 instead of wrapping: whoever reads the total sees that it is
+// running sums in render/bin.rs. Sums stop at 2^32 - 1 instead of wrapping: a reader of the total sees that it is
 // too many.
 //
 // Three dispatches: block_sums (a workgroup a block of 2,048), total (one workgroup), offsets (as block_sums).
-// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of steps on
-// tables that stay, [3] stops them all (frame.rs, `count`): 1 + the view that had more things than there is room for, [4];
-// 2 scan_in, 3 scan_out: one a thing; 4 scan_sums: one a block; 5 arguments of indirect dispatches: two triples are
-// written from arguments_at on, one thread a thing and 2,048 things a workgroup. Five storage buffers.
+// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of
+// steps on tables that stay, [3] stops them all (frame.rs, `count`): 1 + the view that had more things than there is
+// room for, [4]; 2 scan_in, 3 scan_out: one a thing; 4 scan_sums: one per block; 5 arguments of indirect dispatches:
+// two triples are written from arguments_at on, one thread a thing and 2,048 things a workgroup. Five storage buffers.
 // A thread owns eight neighbouring numbers; in `total`, a run of neighbouring blocks.
 
 const SCAN_THREADS: u32 = 256u;
@@ -19,7 +19,7 @@ struct ScanPass {
     count_index: u32,
     total_index: u32,
     arguments_at: u32,
-    capacity: u32, // more things than this are not dispatched at all: the total says that they were too many
+    capacity: u32, // more things than this are not dispatched at all: the total states that they were too many
     view: u32,     // 1 + the view of a step that stops then, as all that follow it; 0: of no step
     unused_0: u32,
     unused_1: u32,

@@ -1,12 +1,12 @@
-// One Gaussian of space and time and what its slice at t is made of. Twin of motion/native4d/slice.rs, where the equations
-// stand; learnt.wgsl and numbers.wgsl are put in front of this file.
+// One Gaussian of space and time and what its slice at t is made of. Twin of motion/native4d/slice.rs, where the
+// equations are documented; learnt.wgsl and numbers.wgsl are put in front of this file.
 //
-// No bindings and no entry point. A row's own columns: time of the mean, log scale in time, right quaternion. Matrices are
-// held by rows: m[i] is row i.
+// No bindings and no entry point. A row's own columns: time of the mean, log scale in time, right quaternion. Matrices
+// are held by rows: m[i] is row i.
 
 const LOG_TIME_SCALE: u32 = 1u;
 const RIGHT: u32 = 2u;
-// The life's exponent stops at half of this.
+// The lifespan's exponent stops at half of this.
 const FAINTEST: f32 = 60.0;
 
 struct Slice {
@@ -28,13 +28,13 @@ struct Slice {
     grows: bool,        // whether the scale in time is below its ceiling
 }
 
-fn time_of(ask: Ask, row: u32) -> f32 {
-    return params[at(row, ask.own_at, ask.width)];
+fn time_of(query: Query, row: u32) -> f32 {
+    return params[at(row, query.own_at, query.width)];
 }
 
 // Cosine and sine of block n's wave.
-fn wave(ask: Ask, row: u32, n: u32) -> vec2<f32> {
-    return turned(f32(n) * ask.pace * (time_of(ask, row) - ask.t));
+fn wave(query: Query, row: u32, n: u32) -> vec2<f32> {
+    return turned(f32(n) * query.pace * (time_of(query, row) - query.t));
 }
 
 fn from_products(l: vec4<f32>, r: vec4<f32>) -> mat4x4<f32> {
@@ -63,23 +63,23 @@ fn to_products(d: mat4x4<f32>) -> mat4x4<f32> {
     );
 }
 
-fn slice_of(ask: Ask, row: u32) -> Slice {
+fn slice_of(query: Query, row: u32) -> Slice {
     var s: Slice;
-    s.mean = three(ask, row, 0u);
-    s.logit = params[at(row, OPACITY, ask.width)];
-    s.left = unit_of(four(ask, row, QUAT));
-    s.right = unit_of(four(ask, row, ask.own_at + RIGHT));
+    s.mean = three(query, row, 0u);
+    s.logit = params[at(row, OPACITY, query.width)];
+    s.left = unit_of(four(query, row, QUAT));
+    s.right = unit_of(four(query, row, query.own_at + RIGHT));
     s.rotation = from_products(s.left.quat, s.right.quat);
-    let log_time = params[at(row, ask.own_at + LOG_TIME_SCALE, ask.width)];
-    s.grows = log_time < ask.ceiling;
-    s.scales = vec4<f32>(exp(three(ask, row, LOG_SCALE)), ask.speed * exp(min(log_time, ask.ceiling)));
+    let log_time = params[at(row, query.own_at + LOG_TIME_SCALE, query.width)];
+    s.grows = log_time < query.ceiling;
+    s.scales = vec4<f32>(exp(three(query, row, LOG_SCALE)), query.speed * exp(min(log_time, query.ceiling)));
     for (var i = 0u; i < 4u; i++) {
         s.l[i] = s.rotation[i] * s.scales;
     }
     let e = s.l[3];
     let q = e * e;
     s.c = q.x + q.y + q.z + q.w;
-    s.lifted = max(s.c, ask.floor);
+    s.lifted = max(s.c, query.floor);
     s.inverse = 1.0 / s.lifted;
     let rest = s.lifted - s.c;
     // The projector's diagonal as sums of the other squares: 1 - e_k^2/c would lose the digits that matter.
@@ -92,7 +92,7 @@ fn slice_of(ask: Ask, row: u32) -> Slice {
         let others = vec4<f32>(g.y + g.z + g.w, g.x + g.z + g.w, g.x + g.y + g.w, g.x + g.y + g.z);
         s.k[i] = s.l[i] * diagonal - others * scaled;
     }
-    s.tau = ask.speed * (ask.t - time_of(ask, row));
+    s.tau = query.speed * (query.t - time_of(query, row));
     let square = s.tau * s.tau * s.inverse;
     s.near = square < FAINTEST;
     s.square = min(square, FAINTEST);

@@ -1,13 +1,14 @@
-// The splats of a layer of Gaussians of space and time, who is alive, and the weights of their blocks of colours. Twin of
-// Motion::at for `native4d` and of layers/envelope.rs; learnt.wgsl, numbers.wgsl and slice.wgsl are put in front of this file.
+// The splats of a layer of Gaussians of space and time, who is alive, and the weights of their blocks of colours. Twin
+// of Motion::at for `native4d` and of layers/envelope.rs; learnt.wgsl, numbers.wgsl and slice.wgsl are put in front of
+// this file.
 //
-// Bindings, group 0: 0 ask; 1 params; out: 2 geometry and 3 alive as answer.wgsl writes them, 4 weights as splats.wgsl reads
-// them, [row / 16][block][16], where there are several blocks; 5 counts ([3]: stopped). Five storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 query; 1 params; out: 2 geometry and 3 alive as answer.wgsl writes them, 4 weights as
+// splats.wgsl reads them, [row / 16][block][16], where there are several blocks; 5 counts ([3]: stopped). Five storage
+// buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 
-@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(0) var<uniform> query: Query;
 @group(0) @binding(1) var<storage, read> params: array<f32>;
 @group(0) @binding(2) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(3) var<storage, read_write> alive: array<u32>;
@@ -21,14 +22,14 @@ fn cov(s: Slice, blur: f32, i: u32, j: u32) -> f32 {
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Who lives in a step that has stopped must stay known.
-    if (row >= ask.rows || counts[3] != 0u) {
+    // The list of live rows of a stopped step must stay.
+    if (row >= query.rows || counts[3] != 0u) {
         return;
     }
-    let s = slice_of(ask, row);
+    let s = slice_of(query, row);
     let opacity = sigmoid(s.logit) * exp(-0.5 * s.square);
     // Phrased so that what is not a number is kept and found by Adam, not hidden.
-    let lives = !(abs(s.tau) > ask.widest * sqrt(s.lifted) || opacity < ask.alpha_min);
+    let lives = !(abs(s.tau) > query.widest * sqrt(s.lifted) || opacity < query.alpha_min);
     // What the floor adds to c leaves a part of v in the slice.
     let blur = (s.lifted - s.c) * s.inverse * s.inverse;
     let mean = s.mean + s.v * (s.tau * s.inverse);
@@ -44,13 +45,13 @@ fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     geometry[to + 128u] = cov(s, blur, 2u, 2u);
     geometry[to + 144u] = select(0.0, opacity, lives);
     var mark = select(0u, 1u, lives);
-    if ((ask.flags & ASK_FIRST) == 0u) {
+    if ((query.flags & QUERY_FIRST) == 0u) {
         mark |= alive[row];
     }
     alive[row] = mark;
-    if (ask.blocks > 1u) {
-        for (var n = 0u; n < ask.blocks; n++) {
-            weights[at(row, n, ask.blocks)] = wave(ask, row, n).x;
+    if (query.blocks > 1u) {
+        for (var n = 0u; n < query.blocks; n++) {
+            weights[at(row, n, query.blocks)] = wave(query, row, n).x;
         }
     }
 }

@@ -7,8 +7,8 @@
 //   scan        256 workgroups; 1 is enough for up to SORT_FEW blocks
 //   scatter     as histogram
 // A block is SORT_BLOCK pairs; blocks = ceil(pairs / SORT_BLOCK), at most 65,535. The number of pairs is read from
-// sort_count, so that an earlier dispatch decides it; dispatch indirectly, or for the most pairs there can be.
-// Pairs beyond the end of keys_in do not exist, whatever sort_count says.
+// sort_count, so that an earlier dispatch decides it; dispatch indirectly, or for the most pairs there can be. Pairs
+// beyond the end of keys_in do not exist, whatever sort_count states.
 //
 // Bindings, group 0; every entry point uses the ones in brackets:
 //   0 uniform sort_pass: shift = 0, 8, 16 or 24; count_index = where in sort_count the number of pairs is  [all]
@@ -26,8 +26,8 @@ const SORT_BLOCK: u32 = 2048u; // SORT_THREADS x SORT_ROUNDS
 const SORT_ROW: u32 = 16u;
 // Up to this many blocks one thread walks along a digit's counts: fewer steps than a workgroup's sums take.
 const SORT_FEW: u32 = 32u;
-// 32-bit words that hold a byte for each thread. Bits by digit and thread would need fewer steps, but 8 KiB of workgroup
-// memory, which software devices take a second to compile.
+// 32-bit words that hold a byte for each thread. Bits by digit and thread would need fewer steps, but 8 KiB of
+// workgroup memory, which software devices take a second to compile.
 const SORT_WORDS: u32 = 64u;
 
 struct SortPass {
@@ -81,7 +81,7 @@ fn histogram(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_
     }
 }
 
-// Exclusive sums over the workgroup's 256 numbers, one a thread; uses sort_sums and sort_rows. Rows of 16 keep it at
+// Exclusive sums over the workgroup's 256 numbers, one per thread; uses sort_sums and sort_rows. Rows of 16 keep it at
 // two barriers: software devices pay for each, and on others the few more additions cost nothing.
 fn sort_exclusive(thread: u32, value: u32) -> u32 {
     sort_sums[thread] = value;
@@ -105,8 +105,8 @@ fn sort_exclusive(thread: u32, value: u32) -> u32 {
     return before;
 }
 
-// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit; where there are
-// few blocks, the first workgroup does all of it, a thread a digit.
+// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit; where there
+// are few blocks, the first workgroup does all of it, a thread a digit.
 @compute @workgroup_size(256)
 fn scan(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let blocks = sort_blocks();
@@ -143,13 +143,13 @@ fn sort_run(first: u32, end: u32, start: u32) -> u32 {
     return before;
 }
 
-// Moves the pairs of a block to their places. A workgroup owns a block; in each round a thread owns one pair.
+// Moves the pairs of a block to their sorted positions. A workgroup owns a block; in each round a thread owns one pair.
 @compute @workgroup_size(256)
 fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let pairs = sort_pairs();
     let blocks = sort_blocks();
     let block = group.x;
-    // Where the next pair of each digit goes: the digits below, this digit's blocks below, then the rounds below.
+    // Index of the next pair of each digit: the digits below, this digit's blocks below, then the rounds below.
     let total = select(0u, sort_counts[SORT_THREADS * blocks + thread], block < blocks);
     var next = sort_exclusive(thread, total);
     if (block < blocks) {

@@ -1,8 +1,10 @@
-// The last dispatch of a pass of sort.wgsl on devices with subgroups of 8 to 64 threads, a power of two: the same pairs go to the
-// same places. sort.wgsl, whose bindings these are, is put in front of this file. 11 KiB of workgroup memory.
+// The last dispatch of a pass of sort.wgsl on devices with subgroups of 8 to 64 threads, a power of two: the same pairs
+// go to the same positions. sort.wgsl, whose bindings these are, is put in front of this file. 11 KiB of workgroup
+// memory.
 //
-// Threads of a subgroup vote on the bits of their digits, so that each knows its peers of the same digit; those below it are its
-// rank. How many peers each subgroup has is kept a byte a digit, and a thread a digit adds up the subgroups in their order.
+// Threads of a subgroup vote on the bits of their digits, so that each gets its peers of the same digit; those below it
+// are its rank. How many peers each subgroup has is kept a byte a digit, and a thread a digit adds up the subgroups in
+// their order.
 
 // Of 8 threads each; a byte each for 256 digits.
 const SORT_SUBGROUPS: u32 = 32u;
@@ -11,7 +13,7 @@ const SORT_VOTE_WORDS: u32 = 2048u; // SORT_SUBGROUPS x 64
 // By subgroup and digit: pairs of the round, then those of the subgroups below.
 var<workgroup> sort_votes: array<atomic<u32>, SORT_VOTE_WORDS>;
 
-// The threads of the subgroup whose digit is this one's; those without a pair agree with nobody.
+// The threads of the subgroup whose digit is this one's; those without a pair have no peers.
 fn sort_peers(digit: u32, there: bool) -> vec4<u32> {
     var peers = subgroupBallot(there);
     for (var bit = 0u; bit < 8u; bit++) {
@@ -64,13 +66,14 @@ fn scatter_subgroup(
         let ranks = countOneBits(peers.xy & under);
         let rank = ranks.x + ranks.y;
         workgroupBarrier();
-        // The first of the peers tells how many they are: at most 64, so that bytes hold it.
+        // The first of the peers writes their number: at most 64, so that bytes hold it.
         if (there && rank == 0u) {
             let all = countOneBits(peers.xy);
             atomicOr(&sort_votes[subgroup * 64u + digit / 4u], (all.x + all.y) << (8u * (digit % 4u)));
         }
         workgroupBarrier();
-        // A thread a word: four digits, added up over the subgroups below, of which fewer than 256 pairs are, and in all.
+        // A thread a word: four digits, added up over the subgroups below, of which fewer than 256 pairs are, and in
+        // all.
         if (index < 64u) {
             var sum = 0u;
             for (var s = 0u; s < subgroups; s++) {

@@ -1,11 +1,11 @@
-// From the sums of a splat's records to the gradients of its Gaussian. Twin of Raster::collect in render/rasterize.rs and of
-// the VJP in render/project.rs; render/project.wgsl and render/project_back.wgsl are put in front of this file.
+// From the sums of a splat's records to the gradients of its Gaussian. Twin of Raster::collect in render/rasterize.rs
+// and of the VJP in render/project.rs; render/project.wgsl and render/project_back.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 piece; 2 geometry as in splats.wgsl; 3 shapes, 4 colors, 5 marks as that wrote them; 6 sums of
-// gather.wgsl; out: 7 back, five vec4 a splat (mean, opacity; covariance xx xy xz yy; yz zz, radius, 0; colour, norm of the
-// centre's gradient; the colour that was drawn, norm of the absolute gradients), all 0 where it was not visible; 8 cameras,
-// seven sums a workgroup (the pose's six, the focal lengths'). Seven storage buffers, 7 KiB of workgroup memory.
-// A thread owns one row.
+// Bindings, group 0: 0 view; 1 piece; 2 geometry as in splats.wgsl; 3 shapes, 4 colors, 5 marks as that wrote them; 6
+// sums of gather.wgsl; out: 7 back, five vec4 a splat (mean, opacity; covariance xx xy xz yy; yz zz, radius, 0; colour,
+// norm of the centre's gradient; the colour that was rendered, norm of the absolute gradients), all 0 where it was not
+// visible; 8 cameras, seven sums a workgroup (the pose's six, the focal lengths'). Seven storage buffers, 7 KiB of
+// workgroup memory. A thread owns one row.
 
 const TABLE_BLOCK: u32 = 16u;
 const GEOMETRY_WIDTH: u32 = 10u;

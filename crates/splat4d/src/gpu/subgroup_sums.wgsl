@@ -1,16 +1,16 @@
-// What both ways back through a tile with subgroups share: what lies in workgroup memory, how it is filled and records are written,
-// and sums over subgroups of 8 to 64 threads, a power of two, in an order that the size of subgroups alone decides.
-// render/project.wgsl and blend_back.wgsl are put in front of this file, rasterize_back_subgroup.wgsl or rasterize_back_vector.wgsl
-// behind it. 7 KiB of workgroup memory.
+// What both ways back through a tile with subgroups share: what lies in workgroup memory, how it is filled and records
+// are written, and sums over subgroups of 8 to 64 threads, a power of two, in an order that the size of subgroups alone
+// decides. render/project.wgsl and blend_back.wgsl are put in front of this file, rasterize_back_subgroup.wgsl or
+// rasterize_back_vector.wgsl behind it. 7 KiB of workgroup memory.
 //
-// A workgroup owns a tile and goes front to back; a thread owns four pixels of a column, so that what depends on dx alone is
-// multiplied once. Sums go through butterflies in which a thread keeps half of its numbers at each of the first exchanges and gives
-// away the other half; what subgroups have then is added in their order.
+// A workgroup owns a tile and goes front to back; a thread owns four pixels of a column, so that what depends on dx
+// alone is multiplied once. Sums go through butterflies in which a thread keeps half of its numbers at each of the
+// first exchanges and gives away the other half; what subgroups have then is added in their order.
 
 const THREADS: u32 = 64u;
 const PIXELS: u32 = 4u;
-// Splats between two barriers, at most one a thread, and subgroups at most, of 8 threads each. The form with vectors has others where
-// no subgroup is so small (gpu/kernels.rs).
+// Splats between two barriers, at most one per thread, and subgroups at most, of 8 threads each. The form with vectors
+// has others where no subgroup is so small (gpu/kernels.rs).
 const SPLATS: u32 = 16u;
 const MOST_SUBGROUPS: u32 = 8u;
 
@@ -74,7 +74,7 @@ fn total(i: u32, n: u32, subgroups: u32) -> f32 {
     return sum;
 }
 
-// Reads the splats from `start` on into workgroup memory, one a thread.
+// Reads the splats from `start` on into workgroup memory, one per thread.
 fn read_splats(start: u32, end: u32, thread: u32) {
     if (thread < SPLATS && start + thread < end) {
         let pair = values[start + thread];

@@ -129,7 +129,7 @@ fn skewed(width: usize, height: usize) -> Camera {
     camera
 }
 
-/// Everything that the GPU draws.
+/// Everything that the GPU renders.
 fn shot<'a>(splats: &'a Splats<'a, f32>, camera: &'a Camera) -> Shot<'a> {
     Shot { depth: true, ..Shot::new(splats, camera, BACKGROUND) }
 }
@@ -140,7 +140,7 @@ fn on_cpu(shot: &Shot<'_>, config: &RenderConfig) -> (Renderer<f32>, Image<f32>)
     (renderer, image)
 }
 
-/// Things in a block of a sum or of a sort.
+/// Items in a block of a sum or of a sort.
 fn block() -> usize {
     Tuning::default().block()
 }

@@ -1,13 +1,13 @@
-// What holds the poses of a tracked frame: along the edges of a graph rigidity, rotation and isometry, a floor, and a background that
-// stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, where the equations stand; learnt.wgsl is put in front of this
-// file.
+// What holds the poses of a tracked frame: along the edges of a graph rigidity, rotation and isometry, a floor, and a
+// background that stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, which document the equations;
+// learnt.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 rule; 2 params; 3 before, two vec4 a point: position, quaternion of the frame before; 4 edges, four
-// words each: where it leads to, length and weight as bits; 5 links: from 0 on the first edge to each point and one past the last,
-// from rule.back_at on the edges to points, from rule.rows_at on the rows of points and of the background; in and out: 6 turns, a
-// vec4 a point; 7 d_params, which is added to; 8 status: from rule.sums_at on the loss of each workgroup, as bits; 9 counts ([3]:
-// stopped). Eight storage buffers.
-// A thread owns one point, or one row of the background, and adds what its edges pull at both their ends.
+// Bindings, group 0: 0 query; 1 rule; 2 params; 3 before, two vec4 a point: position, quaternion of the frame before; 4
+// edges, four words each: where it leads to, length and weight as bits; 5 links: from 0 on the first edge to each point
+// and one past the last, from rule.back_at on the edges to points, from rule.rows_at on the rows of points and of the
+// background; in and out: 6 turns, a vec4 a point; 7 d_params, which is added to; 8 status: from rule.sums_at on the
+// loss of each workgroup, as bits; 9 counts ([3]: stopped). Eight storage buffers. A thread owns one point, or one row
+// of the background, and adds what its edges pull at both their ends.
 
 // Keeps the root's derivative finite (loss/rigid.rs).
 const UNDER_ROOT: f32 = 1e-20;
@@ -29,7 +29,7 @@ struct TieRule {
     height: f32,
 }
 
-@group(0) @binding(0) var<uniform> ask: Ask;
+@group(0) @binding(0) var<uniform> query: Query;
 @group(0) @binding(1) var<uniform> rule: TieRule;
 @group(0) @binding(2) var<storage, read> params: array<f32>;
 @group(0) @binding(3) var<storage, read> before: array<vec4<f32>>;
@@ -51,7 +51,7 @@ fn row_of(point: u32) -> u32 {
 }
 
 fn place(point: u32) -> vec3<f32> {
-    return three(ask, row_of(point), ask.poses_at);
+    return three(query, row_of(point), query.poses_at);
 }
 
 // The turn of each point since the frame before.
@@ -61,18 +61,18 @@ fn turns_of(@builtin(global_invocation_id) id: vec3<u32>) {
     if (i >= rule.points) {
         return;
     }
-    let now = unit_of(four(ask, row_of(i), ask.poses_at + QUAT)).quat;
+    let now = unit_of(four(query, row_of(i), query.poses_at + QUAT)).quat;
     let old = unit_of(before[2u * i + 1u]).quat;
     turns[i] = product(now, vec4<f32>(old.x, -old.yzw));
 }
 
-// An edge from i to j: its loss, and what it pulls at j, turned and in place.
+// An edge from i to j: its loss, and its gradient to j's turn and position.
 struct Pull {
     loss: f32,
     residual: vec3<f32>, // gradient to the offset in the axes of the frame before
     offset: vec3<f32>,
     force: vec3<f32>,
-    turn: vec4<f32>,     // at j's turn; at i's the other way round, times sign
+    turn: vec4<f32>,     // at j's turn; at i's inverted, times sign
     sign: f32,
 }
 
@@ -104,7 +104,7 @@ fn pull(edge: vec4<u32>, i: u32, j: u32) -> Pull {
 }
 
 fn add(row: u32, d_x: vec3<f32>, d_quat: vec4<f32>) {
-    let x = at(row, ask.poses_at, ask.width);
+    let x = at(row, query.poses_at, query.width);
     for (var k = 0u; k < 3u; k++) {
         d_params[x + k * TABLE_BLOCK] += d_x[k];
     }
@@ -144,15 +144,15 @@ fn hold_point(i: u32) -> f32 {
         d_x -= rule.floor * rule.up;
     }
     d_turn += rotation_back(turns[i], d_rotation);
-    let now = unit_of(four(ask, row, ask.poses_at + QUAT));
+    let now = unit_of(four(query, row, query.poses_at + QUAT));
     add(row, d_x, unit_back(now, product(d_turn, unit_of(before[2u * i + 1u]).quat)));
     return sum;
 }
 
 fn hold_background(row: u32) -> f32 {
-    let now = four(ask, row, ask.poses_at + QUAT);
-    let then = four(ask, row, QUAT);
-    let off = three(ask, row, ask.poses_at) - three(ask, row, 0u);
+    let now = four(query, row, query.poses_at + QUAT);
+    let then = four(query, row, QUAT);
+    let off = three(query, row, query.poses_at) - three(query, row, 0u);
     // Both signs of a quaternion are one turn.
     let turned = now - select(then, -then, dot(now, then) < 0.0);
     add(row, rule.stays.x * sign(off), rule.stays.y * sign(turned));
@@ -166,7 +166,7 @@ fn hold(
     @builtin(local_invocation_index) thread: u32,
 ) {
     var sum = 0.0;
-    // Where steps have stopped the view is drawn again, and what other views gave must stay as it is.
+    // Where steps have stopped the view is rendered again, and what other views gave must stay as it is.
     if (counts[3] == 0u) {
         if (id.x < rule.points) {
             sum = hold_point(id.x);

@@ -3,11 +3,11 @@
 // render/project.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 band; 2 counts ([1]: visible splats, [2]: pairs); 3 order (splats, nearest first);
-// 4 shapes; 5 tile_counts (written by count), 6 first_pairs (their exclusive sums, read by emit); written by emit, one a
-// pair: 7 keys (tile within the band), 8 values (number of the pair), 9 owners (splat, and its quadrants of the tile).
-// Eight storage buffers.
+// 4 shapes; 5 tile_counts (written by count), 6 first_pairs (their exclusive sums, read by emit); written by emit, one
+// a pair: 7 keys (tile within the band), 8 values (number of the pair), 9 owners (splat, and its quadrants of the
+// tile). Eight storage buffers.
 // count: a thread owns a splat. emit: a workgroup owns 256 splats, and its threads share out their pairs, so that a
-// splat over the whole picture holds nobody up for long. The two are compiled apart, and rounding may make them disagree
+// splat over the whole image delays no thread for long. The two are compiled apart, and rounding may make them disagree
 // by a tile: a slot without a tile gets one past the last tile, which sorts it behind all lists.
 
 const TILE: u32 = 16u;
@@ -48,8 +48,8 @@ fn tile_rows(shape: vec4<f32>) -> vec2<u32> {
     return vec2<u32>(first, max(min(u32(high) / TILE + 1u, band.first_row + band.rows), first));
 }
 
-// The columns of pixels, first and one past the last, of which a centre in the rows first to first + rows - 1 lies inside
-// the ellipse of level tau.
+// The columns of pixels, first and one past the last, of which a centre in the rows first to first + rows - 1 lies
+// inside the ellipse of level tau.
 fn pixel_span(shape: vec4<f32>, conic: vec3<f32>, tau: f32, first: u32, rows: u32) -> vec2<u32> {
     // Offsets of the rows' pixel centres from the splat's centre, cut to the ellipse's box.
     let top = max(f32(first) + 0.5 - shape.y, -shape.w);
@@ -57,8 +57,8 @@ fn pixel_span(shape: vec4<f32>, conic: vec3<f32>, tau: f32, first: u32, rows: u3
     if (!(top <= bottom)) {
         return vec2<u32>(0u);
     }
-    // The ellipse is x = slope dy +- reach sqrt(1 - (dy / half height)^2); its left and right ends lie at dy = -+ summit.
-    // Both branches are farthest out as near to their ends as the row comes.
+    // The ellipse is x = slope dy +- reach sqrt(1 - (dy / half height)^2); its left and right ends lie at dy = -+
+    // summit. Both branches are farthest out as near to their ends as the row comes.
     let slope = -conic.y / conic.x;
     let reach = sqrt(tau / conic.x);
     let summit = -conic.y / conic.z * shape.z;

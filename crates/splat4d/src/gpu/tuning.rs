@@ -1,14 +1,14 @@
-//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so, last bits: what
-//! a sweep on a card varies.
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so,
+//! last bits: a sweep on a GPU varies them.
 
 use super::limits::THREADS;
 
-/// See the module's documentation. The defaults are the portable ones, chosen without a card.
+/// See the module's documentation. The defaults are the portable ones, chosen without a GPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tuning {
     /// Threads of a workgroup of the kernels over rows that stay on the GPU.
     pub row_threads: usize,
-    /// Things that a thread of a sort, of a sum or of the search for tiles' lists handles.
+    /// Items that a thread of a sort, of a sum or of the search for tiles' lists handles.
     pub rounds: usize,
     /// Splats that a tile reads at a time, to blend them.
     pub batch: usize,
@@ -37,7 +37,8 @@ impl Default for Tuning {
     }
 }
 
-/// What a sweep tries. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device has.
+/// Values of a sweep. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device
+/// has.
 const ROW_THREADS: [usize; 2] = [64, 128];
 const ROUNDS: [usize; 3] = [2, 4, 16];
 const BATCHES: [usize; 3] = [32, 64, 128];
@@ -66,7 +67,7 @@ impl Tuning {
         out
     }
 
-    /// What is not as by default, `name=value`.
+    /// Deviations from the default, `name=value`.
     pub fn changes(&self) -> Option<String> {
         let numbers = |t: &Self| {
             [
@@ -84,12 +85,12 @@ impl Tuning {
         (!words.is_empty()).then(|| words.join(" "))
     }
 
-    /// Things in a block of a sum or of a sort (scan.wgsl, sort.wgsl).
+    /// Items in a block of a sum or of a sort (scan.wgsl, sort.wgsl).
     pub(super) fn block(&self) -> usize {
         THREADS * self.rounds
     }
 
-    /// A shader's text with these constants in place of those that stand there.
+    /// A shader's text with these constants in place of its own.
     pub(super) fn text(&self, shader: &str) -> String {
         let constants = [
             ("ROW_THREADS", self.row_threads),

@@ -1,4 +1,4 @@
-//! A scene's tables on the GPU, just as they are in memory: `[row / 16][column][16]`.
+//! A scene's tables on the GPU, in their memory layout: `[row / 16][column][16]`.
 //!
 //! Tables of colours may be larger than a binding: they are cut by rows, and each cut is projected and coloured by a
 //! dispatch of its own.
@@ -34,7 +34,7 @@ pub(super) struct Piece {
     layer_from_world: [[f32; 4]; 3],
 }
 
-/// Columns of a rotation (rows), as a uniform's mat3x3 has them.
+/// Columns of a rotation (rows), as in a uniform's mat3x3.
 fn columns(r: Option<[[f32; 3]; 3]>) -> [[f32; 4]; 3] {
     let r = r.unwrap_or([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
     std::array::from_fn(|c| [r[0][c], r[1][c], r[2][c], 0.0])
@@ -88,7 +88,7 @@ impl PartBuffers {
 /// The tables of all parts.
 #[derive(Debug, Default)]
 pub(super) struct Upload {
-    /// One a part of the largest scene so far.
+    /// One per part of the largest previous scene.
     pub parts: Vec<PartBuffers>,
     /// Dispatches of the last scene.
     pub draws: Vec<Draw>,
@@ -125,7 +125,7 @@ impl Upload {
         Ok(())
     }
 
-    /// Makes room for layers of so many rows, columns and blocks of SH, which kernels fill, and lists the dispatches. What
+    /// Allocates layers of this many rows, columns and blocks of SH, which kernels fill, and lists the dispatches. What
     /// buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
     pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize, usize)]) -> Result<()> {
         self.draws.clear();

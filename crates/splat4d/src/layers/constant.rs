@@ -1,5 +1,6 @@
 //! A dynamic scene with the same Gaussians in the same order at every time: what programs need that interpolate between
-//! frames, blur by motion or encode differences. A Gaussian stays where it was first or last seen while it does not live.
+//! frames, blur by motion or encode differences. A Gaussian stays where it was first or last seen while it does not
+//! live.
 
 use super::{Layer, Scene, freeze_rows};
 use crate::Result;
@@ -7,7 +8,7 @@ use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH, Time};
 
-/// Opacity (logit) of a Gaussian that does not live: alpha 2·10⁻⁹, far below what is rendered.
+/// Opacity (logit) of a Gaussian that is not alive: alpha 2·10⁻⁹, far below what is rendered.
 pub(crate) const HIDDEN: f32 = -20.0;
 
 /// The frames of a scene as rows that are the same Gaussian in all of them.
@@ -16,9 +17,9 @@ pub struct Constant<'a> {
     times: Vec<f64>,
     /// By layer: for each row its place among the kept ones; [`u32::MAX`]: never alive.
     places: Vec<Vec<u32>>,
-    /// Every kept row as it is when it is first alive, its opacity hidden.
+    /// Every kept row at the first time at which it is alive, its opacity hidden.
     first: Params<f32>,
-    /// The rows at the last time that was asked for.
+    /// The rows at the last time that was queried for.
     now: Params<f32>,
 }
 
@@ -66,8 +67,8 @@ impl<'a> Constant<'a> {
         &self.times
     }
 
-    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian does not live. Frames are asked for one after the
-    /// other; frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
+    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian is not alive. Frames are requested one after the other;
+    /// frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
     pub fn frame(&mut self, i: usize) -> &Params<f32> {
         if i == 0 {
             self.now = self.first.clone();
@@ -90,7 +91,7 @@ fn alive(layer: &Layer<f32>, t: f64) -> Vec<u32> {
     rows
 }
 
-/// Writes rows of a layer as they are at a time to their places.
+/// Writes rows of a layer at a time to their positions.
 fn copy(
     layer: &Layer<f32>,
     rows: &[u32],
@@ -166,7 +167,7 @@ impl Turns {
         };
         let forms = self.0.iter().map(|(turn, axes)| (quat::product(q, *turn), axes.map(|a| s[a])));
         let best = forms.min_by(|a, b| cost(a.0, a.1).total_cmp(&cost(b.0, b.1))).expect("there are 24 forms");
-        // The shape as it is where nothing is gained but rounding.
+        // The unchanged shape where a conversion would only add rounding.
         let (q, s) = if cost(best.0, best.1) < cost(q, s) - 1e-6 { best } else { (q, s) };
         (signed(q), s)
     }
@@ -180,7 +181,7 @@ mod tests {
     use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::scene::{LIFE, LifeKind};
 
-    /// Gaussians that fly, spin and live for a part of a second.
+    /// Gaussians that fly, spin and have lifespans of a part of a second.
     fn moving() -> Scene<f32> {
         let life = LifeKind::GaussHalf;
         let mut params = Params::new(60, 4, life.columns());
@@ -222,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_keep_their_gaussian_and_hide_it_outside_its_life() {
+    fn rows_keep_their_gaussian_and_hide_it_outside_its_lifespan() {
         let scene = moving();
         let times: Vec<f64> = (0..8).map(|i| scene.clip[0] + f64::from(i) / scene.fps).collect();
         let mut constant = Constant::new(&scene, times.clone()).unwrap();

@@ -1,5 +1,5 @@
-//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
-//! velocity, and a life: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
+//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a
+//! constant velocity, and a lifespan: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
 
 use super::Layer;
 use crate::math::{Real, quat, sym3};
@@ -21,7 +21,7 @@ fn cannot(what: &str, remedy: &str) -> Error {
     Error::input(what.to_owned()).remedy(remedy.to_owned())
 }
 
-/// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer as it is.
+/// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer unchanged.
 ///
 /// Errors: those of `to_spacetime`.
 pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {
@@ -40,7 +40,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
     };
     if spec.harmonics > 0 {
         return Err(cannot(
-            "colours that change with time have no place in spacetime",
+            "spacetime does not support colours that change with time",
             "Train with sh_harmonics=0, or bake the scene",
         ));
     }
@@ -66,13 +66,13 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 }
 
 /// A `spacetime` layer as a `native4d` one with the given spec (its harmonics start at zero): the same image at every
-/// time, where the lives are within the spec's bounds.
+/// time, where the lifespans are within the spec's bounds.
 ///
-/// Errors: the layer moves otherwise, along curves, turns, or its life is no Gaussian; a spec out of its ranges.
+/// Errors: the layer moves otherwise, along curves, turns, or its lifespan is not Gaussian; a spec out of its ranges.
 pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
         Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {
-            return Err(cannot("features have no place in native4d", "Train with features=none"));
+            return Err(cannot("native4d does not support features", "Train with features=none"));
         }
         Spec::Spacetime(s) if s.order <= 1 && !s.rotation => s,
         _ => {
@@ -88,7 +88,7 @@ pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Laye
         LifeKind::GaussOne => FRAC_1_SQRT_2,
         _ => {
             return Err(cannot(
-                "only a Gaussian life is one of native4d",
+                "native4d supports only Gaussian lifespans",
                 "Train with life=gauss-half or life=gauss-one",
             ));
         }

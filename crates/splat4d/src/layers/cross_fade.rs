@@ -1,10 +1,11 @@
-//! The cross-fade of two layers that show the same: o becomes 1 − (1 − o)^s in the one that comes and 1 − (1 − o)^(1−s) in the
-//! one that goes, so that what both let through, (1 − o)^s (1 − o)^(1−s), is what one of them would. Linear opacities o·s and
-//! o·(1 − s) would let a quarter of the background through an opaque surface half-way.
+//! The cross-fade of two layers that show the same: o becomes 1 − (1 − o)^s in the layer that fades in and 1 − (1 −
+//! o)^(1−s) in the one that fades out, so that the light that both transmit, (1 − o)^s (1 − o)^(1−s), equals that of
+//! one of them. Linear opacities o·s and o·(1 − s) would let a quarter of the background through an opaque surface
+//! half-way.
 //!
-//! It holds where a splat is densest. Around that its alpha is o'g, and two coinciding splats let through
-//! (1 − o₁g)(1 − o₂g), which is less than 1 − og by o₁o₂g(1 − g): never more transparent, and broader by at most a quarter of
-//! o₁o₂. No pair of opacities does better at every g; only a cut does.
+//! It holds where a splat is densest. Around that its alpha is o'g, and two coinciding splats let through (1 − o₁g)(1 −
+//! o₂g), which is less than 1 − og by o₁o₂g(1 − g): never more transparent, and broader by at most a quarter of o₁o₂.
+//! No pair of opacities does better at every g; only a cut does.
 
 use super::Layer;
 use crate::math::Real;
@@ -13,7 +14,7 @@ use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Rows, Table, Time};
 
-/// What is let through is never taken for less: its logarithm is needed.
+/// Smallest transmittance, because its logarithm is needed.
 const LEAST: f64 = 1e-12;
 
 impl<F: Real> Layer<F> {
@@ -123,7 +124,7 @@ mod tests {
         Layer::new("a", params, Arc::new(Still), LifeKind::Infinite)
     }
 
-    /// Two layers of which the first goes while the other comes, from 1 to 2 seconds.
+    /// Two layers of which the first fades out while the other fades in, from 1 to 2 seconds.
     fn pair(log_scale: f64) -> Scene<f64> {
         let going = Layer { span: [0.0, 2.0], cross_fade: [0.0, 1.0], ..layer(log_scale) };
         let coming = Layer { span: [1.0, 3.0], cross_fade: [1.0, 0.0], ..layer(log_scale) };
@@ -134,7 +135,7 @@ mod tests {
         let mut seen = Evaluation::default();
         scene.at(Time(t), &mut seen);
         let (splats, camera) = (scene.splats(&seen), Camera::with_fov_y(Se3::IDENTITY, 0.9, SIZE, SIZE));
-        // Without the blend's shortcuts, which cut at other places where a splat is in two parts.
+        // Without the blend's shortcuts, which cut at other positions where a splat is in two parts.
         let config = RenderConfig { alpha_min: 0.0, transmittance_min: 0.0, ..RenderConfig::default() };
         oracle::render(&Shot::new(&splats, &camera, [0.2, 0.5, 0.7]), &config)
     }

@@ -1,4 +1,4 @@
-//! The life of a layer's Gaussians as loops over lanes: who is alive, the envelope, and its backward pass.
+//! The lifespan of a layer's Gaussians as loops over lanes: who is alive, the envelope, and its backward pass.
 
 use super::ALPHA_MIN;
 use crate::math::Real;
@@ -9,10 +9,10 @@ use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, LifeKind, Rows, Table, Time};
 use crate::simd::{Kernel, Simd, dispatch, each};
 
-/// Rows a task looks at.
+/// Rows per task.
 const TASK_ROWS: usize = 8192;
 
-/// σ, ∂σ/∂t, ∂σ/∂log width and ∂σ/∂log softness of sixteen rows; columns that the life lacks are not read.
+/// σ, ∂σ/∂t, ∂σ/∂log width and ∂σ/∂log softness of sixteen rows; columns that the lifespan lacks are not read.
 #[inline(always)]
 fn eval<F: Real>(kind: LifeKind, columns: &[Lane<F>; 3], t: Time) -> [Lane<F>; 4] {
     // The kind is distinguished outside of the loop over lanes.
@@ -34,7 +34,7 @@ fn eval_lanes<F: Real>(kind: LifeKind, columns: &[Lane<F>; 3], t: Time) -> [Lane
     out
 }
 
-/// The life's columns of a batch; those that the table lacks are zero.
+/// The lifespan's columns of a batch; those that the table lacks are zero.
 #[inline(always)]
 fn read_life<F: Real>(batch: &Batch, table: &Table<F>) -> [Lane<F>; 3] {
     match table.width() {
@@ -55,7 +55,7 @@ pub(super) fn active<F: Real>(geometry: &Table<F>, life: &Table<F>, kind: LifeKi
     ids.truncate(count);
 }
 
-/// Fills the front of `ids`, which has a place for every row from `first` on; returns how many are alive.
+/// Fills the front of `ids`, which has an entry for every row from `first` on; returns how many are alive.
 fn find<F: Real>(alive: &Alive<'_, F>, first: usize, ids: &mut [u32], simd: Simd) -> usize {
     if ids.len() <= TASK_ROWS {
         return dispatch(simd, Find { alive, first, ids });
@@ -116,7 +116,8 @@ impl<F: Real> Kernel for Find<'_, F> {
     }
 }
 
-/// Multiplies the opacity of `out` by the life and fills `life`: [splats, 5], σ, its derivatives, the model's opacity.
+/// Multiplies the opacity of `out` by the lifespan and fills `life`: [splats, 5], σ, its derivatives, the model's
+/// opacity.
 pub(super) fn forward<F: Real>(
     p: &Table<F>,
     kind: LifeKind,
@@ -174,8 +175,8 @@ impl<F: Real> Work<F, 1> for ToMotion<'_, F> {
     }
 }
 
-/// Adds dL/dσ = o·dL/d(o·σ) times σ's derivatives to the life's gradient `d_life`; returns dL/dt. o is the model's opacity,
-/// which need not be the learnt one alone.
+/// Adds dL/dσ = o·dL/d(o·σ) times σ's derivatives to the lifespan's gradient `d_life`; returns dL/dt. o is the model's
+/// opacity, which need not be the learnt one alone.
 pub(super) fn backward<F: Real>(rows: Rows<'_>, d_out: &Table<F>, life: &Table<F>, d_life: &mut Table<F>) -> f64 {
     scatter(&Backward { d_out, life }, [d_life], rows)
 }

@@ -5,7 +5,7 @@ use crate::math::Rng;
 use crate::scene::{Params, RowEdit, Space};
 use crate::{Error, Result};
 
-/// What to do about numbers that are not finite.
+/// Remedy for numbers that are not finite.
 const REMEDY: &str = "The scene is damaged, or an edit made its numbers too large";
 
 impl Params<f32> {

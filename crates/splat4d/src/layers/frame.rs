@@ -1,8 +1,8 @@
 //! A layer's frame: splats taken from the layer's own axes and unit of length to the world's, and their gradient back.
 //!
-//! With A = s R: μ' = A μ + t, Σ' = A Σ Aᵀ; opacity stays. Colours turn because the renderer takes the direction of view to
-//! the layer's axes ([`Part::layer_from_world`](crate::scene::Part)). Where a model's tables can take the frame in
-//! ([`Layer::apply_transform`]), no numbers are lost by a decomposition.
+//! With A = s R: μ' = A μ + t, Σ' = A Σ Aᵀ; opacity stays. Colours turn because the renderer takes the direction of
+//! view to the layer's axes ([`Part::layer_from_world`](crate::scene::Part)). Where a model's tables can take the frame
+//! in ([`Layer::apply_transform`]), no numbers are lost by a decomposition.
 
 use super::Layer;
 use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
@@ -65,7 +65,8 @@ impl<F: Real> Work<F, 1> for Backward<'_, F> {
         let mut rows: [Lane<F>; WIDTH] = batch.at.read(self.d_world, 0);
         for l in 0..BLOCK {
             let mean = apply(&self.transposed, [rows[0][l], rows[1][l], rows[2][l]]);
-            // An off-diagonal's gradient stands for both of its places: halves of it in the full matrix G, and Aᵀ G A.
+            // An off-diagonal's gradient represents both of its positions: halves of it in the full matrix G, and Aᵀ G
+            // A.
             let [xx, xy, xz, yy, yz, zz]: [F; 6] = std::array::from_fn(|k| rows[COV + k][l]);
             let h = F::HALF;
             let g = congruence(&self.transposed, symmetric([xx, h * xy, h * xz, yy, h * yz, zz]));
@@ -104,7 +105,8 @@ fn congruence<F: Real>(a: &[[F; 3]; 3], m: [[F; 3]; 3]) -> [[F; 3]; 3] {
 }
 
 impl Layer<f32> {
-    /// The layer with its frame in its tables, as far as [`apply_transform`](Self::apply_transform) goes; itself where it has none.
+    /// The layer with its frame in its tables, as far as [`apply_transform`](Self::apply_transform) supports it; itself
+    /// where it has none.
     pub(crate) fn with_frame_absorbed(&self) -> Cow<'_, Self> {
         if self.frame.is_identity() {
             return Cow::Borrowed(self);
@@ -115,7 +117,8 @@ impl Layer<f32> {
     }
 
     /// Writes the frame into the tables, after which it is the identity, where the motion model's can take it in
-    /// ([`Motion::apply_transform`](crate::motion::Motion::apply_transform)). Other layers (planes, grids, networks) keep theirs.
+    /// ([`Motion::apply_transform`](crate::motion::Motion::apply_transform)). Other layers (planes, grids, networks)
+    /// keep theirs.
     pub fn apply_transform(&mut self) {
         if self.frame.is_identity() {
             return;
@@ -141,7 +144,7 @@ fn absorb_geometry(params: &mut Params, frame: &Sim3) {
     }
 }
 
-/// `blocks`: how many blocks of coefficients stand side by side.
+/// `blocks`: how many blocks of coefficients are side by side.
 fn absorb_colors(table: &mut Table, blocks: usize, r: &[[f64; 3]; 3]) {
     let m = sh_rotation(r);
     let block = table.width() / blocks;

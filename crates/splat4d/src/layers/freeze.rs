@@ -14,7 +14,7 @@ use rayon::prelude::*;
 const SH0: f32 = crate::math::sh::C0 as f32;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME: f64 = 1e-5;
-/// Smallest scale that comes out of a decomposition, as a share of the largest: below it f32 covariances hold no digit.
+/// Smallest scale of a decomposition, as a share of the largest: below it f32 covariances hold no digit.
 const THINNEST: f64 = 1e-4;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
@@ -46,8 +46,8 @@ pub fn moment(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     }
 }
 
-/// These rows of a layer (strictly increasing) as they are at `time`, life and frame included, as a still layer's
-/// parameters; of Gaussians with features only the base colour is left.
+/// These rows of a layer (strictly increasing) at `time`, lifespan and frame included, as a still layer's parameters;
+/// of Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {
     let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(rows), time);
     let coefficients = (layer.params[SH].width() / 3).clamp(1, MAX_COEFFS);
@@ -74,7 +74,7 @@ pub struct Gaussians {
 const ROWS: usize = 1024;
 
 impl Gaussians {
-    /// What `seen` holds after [`Scene::at`], all layers together. Colours: [`Gaussians::sh`].
+    /// The content of `seen` after [`Scene::at`], all layers together. Colours: [`Gaussians::sh`].
     pub fn of(scene: &Scene<f32>, seen: &Evaluation) -> Self {
         let rows = seen.tapes().map(|t| t.out().rows()).sum();
         let mut all = Self {
@@ -137,7 +137,7 @@ fn coefficients(scene: &Scene<f32>) -> usize {
 struct Shapes<'a> {
     layer: &'a Layer<f32>,
     tape: &'a LayerTape<f32>,
-    /// Quaternion rates, and the centre of those who live for ever.
+    /// Quaternion rates, and the centre of those who have infinite lifespans.
     turning: Option<(Key, f64)>,
 }
 
@@ -166,7 +166,7 @@ impl<'a> Shapes<'a> {
         (quat::normalize(q).0.map(|x| x as f32), s.map(|s| s.exp() as f32))
     }
 
-    /// The raw quaternion, turned as far as it is by then, and the log scales of splat j, in the layer's axes.
+    /// The raw quaternion, rotated to the time, and the log scales of splat j, in the layer's axes.
     #[inline(always)]
     fn learnt(&self, j: usize) -> ([f32; 4], [f32; 3]) {
         let (id, raw) = (self.tape.rows().id(j), &self.layer.params[GEOMETRY]);

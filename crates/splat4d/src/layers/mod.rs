@@ -33,7 +33,7 @@ use crate::scene::{
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// A splat fainter than this is not drawn, so that a Gaussian below it is not alive (1/255, Kerbl et al. 2023).
+/// A splat fainter than this is not rendered, so that a Gaussian below it is not alive (1/255, Kerbl et al. 2023).
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 
 /// The span of a layer that may be seen at any time.
@@ -42,7 +42,7 @@ pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 /// Beginning of the names of layers that show what was predicted, not what was seen.
 pub const PREDICTED: &str = "predicted";
 
-/// Gaussians with one motion model and one kind of life.
+/// Gaussians with one motion model and one kind of lifespan.
 pub struct Layer<F: Real = f32> {
     /// The user's name for it.
     pub name: String,
@@ -50,19 +50,19 @@ pub struct Layer<F: Real = f32> {
     pub params: Params<F>,
     /// How it moves.
     pub motion: Arc<dyn Motion<F>>,
-    /// How long its Gaussians live.
+    /// Lifespans of its Gaussians.
     pub life: LifeKind,
     /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
     pub span: [f64; 2],
-    /// Seconds at the beginning and at the end of the span in which the layer cross-fades with another that shows the same
-    /// there: opacity o becomes 1 − (1 − o)^s, s rising from 0 to 1 and falling back to 0. The one of two whose spans
-    /// overlap by so much rises as the other falls, and where one Gaussian of each coincides they let through what one
-    /// would. Zeros: it begins and ends at once.
+    /// Seconds at the beginning and at the end of the span in which the layer cross-fades with another that shows the
+    /// same there: opacity o becomes 1 − (1 − o)^s, s rising from 0 to 1 and falling back to 0. The one of two whose
+    /// spans overlap by so much rises as the other falls, and where one Gaussian of each coincides they let through
+    /// what one would. Zeros: it begins and ends at once.
     pub cross_fade: [f64; 2],
-    /// Visibility masks of the rows over time; none: all rows alive are drawn.
+    /// Visibility masks of the rows over time; none: all rows alive are rendered.
     pub masks: Option<Arc<KeyMasks>>,
-    /// Where the layer stands: `world_from_layer`, applied to Gaussians after motion and life. Tables, the motion model and
-    /// nodes keep the layer's own axes and unit of length.
+    /// The layer's frame: `world_from_layer`, applied to Gaussians after motion and lifespan. Tables, the motion model
+    /// and nodes keep the layer's own axes and unit of length.
     pub frame: Sim3,
 }
 
@@ -87,7 +87,7 @@ impl<F: Real> std::fmt::Debug for Layer<F> {
     }
 }
 
-/// One layer's answer at one time, and what its backward needs.
+/// One layer's result at one time, and the state for its backward.
 #[derive(Debug)]
 pub struct LayerTape<F = f32> {
     of: Space,
@@ -102,7 +102,7 @@ pub struct LayerTape<F = f32> {
     d_out: Table<F>,
     /// [splats, 10]: `tape.out` in the world; empty where the frame is the identity, and for nodes.
     world: Table<F>,
-    /// Gradient to `tape.out` of a framed answer.
+    /// Gradient to `tape.out` of a framed result.
     d_layer: Table<F>,
 }
 
@@ -124,7 +124,7 @@ impl<F: Real> Default for LayerTape<F> {
 }
 
 impl<F: Real> LayerTape<F> {
-    /// A tape for the question (space, rows, time).
+    /// A tape for the query (space, rows, time).
     pub fn request(&mut self, of: Space, rows: Rows<'_>, t: Time) {
         (self.of, self.t) = (of, t);
         self.ids.clear();
@@ -137,23 +137,23 @@ impl<F: Real> LayerTape<F> {
         }
     }
 
-    /// Asks for the Gaussians of `layer` that are alive at t.
-    pub fn ask_active(&mut self, layer: &Layer<F>, t: Time) {
+    /// Requests the Gaussians of `layer` that are alive at t.
+    pub fn request_active(&mut self, layer: &Layer<F>, t: Time) {
         (self.of, self.t) = (Space::Gaussians, t);
         self.all = layer.active(t, &mut self.ids);
     }
 
-    /// The rows asked for.
+    /// The rows requested.
     pub fn rows(&self) -> Rows<'_> {
         if self.all { Rows::All } else { Rows::Some(&self.ids) }
     }
 
-    /// The space asked for.
+    /// The space requested.
     pub(crate) fn space(&self) -> Space {
         self.of
     }
 
-    /// The time asked for.
+    /// The time requested.
     pub(crate) fn time(&self) -> Time {
         self.t
     }
@@ -163,8 +163,8 @@ impl<F: Real> LayerTape<F> {
         if self.world.width() > 0 { &self.world } else { &self.tape.out }
     }
 
-    /// The question as the motion model sees it.
-    pub fn question<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
+    /// The query as the motion model gets it.
+    pub fn query<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
         At { p, of: self.of, rows: self.rows(), t: self.t }
     }
 }
@@ -189,9 +189,9 @@ impl<F: Real> Layer<F> {
         !(t.0 < self.span[0] || t.0 >= self.span[1])
     }
 
-    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`] and whom
-    /// the masks admit, none outside the layer's span.
-    /// Returns true, and leaves `ids` empty, where every row is meant (infinite life, no masks).
+    /// The rows alive at t into `ids` (strictly increasing): those whose opacity times life reaches [`ALPHA_MIN`] and
+    /// whom the masks admit, none outside the layer's span.
+    /// Returns true, and leaves `ids` empty, where every row is meant (infinite lifespan, no masks).
     pub fn active(&self, t: Time, ids: &mut Vec<u32>) -> bool {
         ids.clear();
         if !self.spans_over(t) {
@@ -246,10 +246,11 @@ impl<F: Real> Layer<F> {
         LifeBuckets::new(self.spans(), clip, count)
     }
 
-    /// Answers the question in `tape`: the motion model, then the life, the cross-fade and the frame. Nodes have none of these.
+    /// Computes the query in `tape`: the motion model, then the lifespan, the cross-fade and the frame. Nodes have none
+    /// of these.
     pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
         let mut own = std::mem::take(&mut tape.tape);
-        self.motion.at(&tape.question(&self.params), cache, &mut own);
+        self.motion.at(&tape.query(&self.params), cache, &mut own);
         tape.tape = own;
         self.fade(tape);
         self.cross_fade(tape);
@@ -260,7 +261,7 @@ impl<F: Real> Layer<F> {
         }
     }
 
-    /// Multiplies the opacities of the answer in `tape` by the life.
+    /// Multiplies the opacities of the result in `tape` by the lifespan.
     fn fade(&self, tape: &mut LayerTape<F>) {
         if self.life == LifeKind::Infinite || tape.of != Space::Gaussians {
             tape.life = Table::default();
@@ -275,7 +276,7 @@ impl<F: Real> Layer<F> {
         envelope::forward(table, self.life, tape.t, rows, &mut tape.tape.out, &mut tape.life);
     }
 
-    /// Cross-fades the opacities of the answer in `tape`.
+    /// Cross-fades the opacities of the result in `tape`.
     fn cross_fade(&self, tape: &mut LayerTape<F>) {
         let (share, _) = self.fade_share(tape.t);
         if share == 1.0 || tape.of != Space::Gaussians {
@@ -287,12 +288,12 @@ impl<F: Real> Layer<F> {
 
     /// The splats that the last [`at`](Self::at) left in `tape`.
     pub fn part<'a>(&'a self, tape: &'a LayerTape<F>) -> Part<'a, F> {
-        let color = self.motion.color(&tape.question(&self.params), &tape.tape);
+        let color = self.motion.color(&tape.query(&self.params), &tape.tape);
         let layer_from_world = if tape.of == Space::Gaussians { self.frame.directions() } else { None };
         Part { out: tape.out(), color, layer_from_world }
     }
 
-    /// Means as the tables have them, before any motion, in the world.
+    /// Means as in the tables, before any motion, in the world.
     pub fn means(&self) -> impl Iterator<Item = [f64; 3]> + '_ {
         let table = &self.params[GEOMETRY];
         (0..table.rows()).map(|row| {
@@ -333,16 +334,16 @@ impl<F: Real> Layer<F> {
             unfaded = SplatGrads { out: &d_fade, ..*d_out };
             &unfaded
         };
-        let question = tape.question(&self.params);
+        let query = tape.query(&self.params);
         if tape.life.width() == 0 {
-            d_time += self.motion.backward(&question, cache, &mut own, d_out, d_cache, d);
+            d_time += self.motion.backward(&query, cache, &mut own, d_out, d_cache, d);
         } else {
-            // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the life dL/dσ = o·dL/do_eff.
+            // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the lifespan dL/dσ = o·dL/do_eff.
             envelope::to_motion(d_out.out, &tape.life, &mut d_motion);
             let [d_life] = d.of([LIFE]);
-            d_time += envelope::backward(question.rows, d_out.out, &tape.life, d_life);
+            d_time += envelope::backward(query.rows, d_out.out, &tape.life, d_life);
             let scaled = SplatGrads { out: &d_motion, ..*d_out };
-            d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
+            d_time += self.motion.backward(&query, cache, &mut own, &scaled, d_cache, d);
         }
         tape.tape = own;
         tape.d_out = d_motion;
@@ -350,7 +351,7 @@ impl<F: Real> Layer<F> {
         d_time
     }
 
-    /// One row edit: gathers every table of its space, then lets the model mend what copying cannot.
+    /// One row edit: gathers every table of its space, then lets the model correct what copying cannot.
     pub fn edit(&mut self, edit: &RowEdit, rng: &Rng) {
         self.params.apply(edit);
         self.masks = self.masks.take().map(|m| Arc::new(m.edited(edit)));
@@ -363,7 +364,7 @@ impl<F: Real> Layer<F> {
     }
 }
 
-/// A row of the life table; columns that it does not have are zero.
+/// A row of the lifespan table; columns that it does not have are zero.
 #[inline(always)]
 fn life_row<F: Real>(table: &Table<F>, id: usize) -> [F; 3] {
     match table.width() {
@@ -416,8 +417,8 @@ pub struct Scene<F: Real = f32> {
     pub fps: f64,
     /// The direction that is up in the world (unit).
     pub up: [f64; 3],
-    /// World coordinates of the scene's origin ([`scene::offset`](crate::scene::offset)): add it to positions of the scene
-    /// for those of the world that its capture or file is in. Zero unless they are far from the origin.
+    /// World coordinates of the scene's origin ([`scene::offset`](crate::scene::offset)): add it to positions of the
+    /// scene for those of the world that its capture or file is in. Zero unless they are far from the origin.
     pub offset: [f64; 3],
     /// How blended channels become colour.
     pub head: Head,
@@ -447,17 +448,17 @@ impl<F: Real> Scene<F> {
         self.layers.iter().map(of).max().unwrap_or(0)
     }
 
-    /// From when on the scene shows what was predicted, seconds; `None`: it was seen as it is.
+    /// Start of the predicted part, seconds; `None`: all of it was observed.
     pub fn predicted_from(&self) -> Option<f64> {
         let predicted = self.layers.iter().filter(|l| l.name.starts_with(PREDICTED));
         predicted.map(|l| l.span[0]).filter(|t| t.is_finite()).min_by(f64::total_cmp)
     }
 
-    /// The scene at time t, for playback: only Gaussians alive then. Question i of `evaluation` becomes layer i.
+    /// The scene at time t, for playback: only Gaussians alive then. Query i of `evaluation` becomes layer i.
     pub fn at(&self, t: Time, evaluation: &mut Evaluation<F>) {
         evaluation.begin();
         for (index, layer) in self.layers.iter().enumerate() {
-            evaluation.ask_active(index, layer, t);
+            evaluation.request_active(index, layer, t);
         }
         evaluation.evaluate(&self.layers);
     }
@@ -467,7 +468,7 @@ impl<F: Real> Scene<F> {
         evaluation.splats(self, evaluation.tapes().next().map_or(Time(0.0), |tape| tape.time()))
     }
 
-    /// The layer that holds the head's weights, and their places there; `None`: there is no head.
+    /// The layer that holds the head's weights, and their positions there; `None`: there is no head.
     pub fn head_keys(&self) -> Option<(usize, HeadKeys)> {
         match self.head {
             Head::Identity => None,
@@ -480,7 +481,7 @@ impl<F: Real> Scene<F> {
         self.head_keys().map(|(layer, keys)| keys.weights(&self.layers[layer].params))
     }
 
-    /// Errors where Gaussians alone do not say how the scene looks: `what` (a format, a way to play) has no pixel head.
+    /// Errors if Gaussians alone do not determine the image: `what` (a format, a player) does not support a pixel head.
     pub fn without_head(&self, what: &str) -> Result<()> {
         match self.head {
             Head::Identity => Ok(()),
@@ -488,7 +489,7 @@ impl<F: Real> Scene<F> {
                 ErrorKind::Unsupported,
                 format!("{what} cannot hold this scene: a network makes its colours, pixel by pixel (features = full)"),
             )
-            .remedy("Train with --set features=none for that; `render` and `eval` draw the scene as it is")),
+            .remedy("Train with --set features=none for that; `render` and `eval` render the scene with it")),
         }
     }
 }

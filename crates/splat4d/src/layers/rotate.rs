@@ -15,7 +15,7 @@ const ALONG_X: f64 = 0.9;
 /// The rotation (rows) that takes direction `from` to `to` the short way. Opposite directions: half a turn about x, which
 /// is what programs with y up and y down do to each other's files; along x, about z.
 ///
-/// `None`: one of them is no direction.
+/// `None`: one of them is not a direction.
 pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
     if [from, to].iter().any(|v| !(se3::norm(*v) > NO_DIRECTION && se3::norm(*v).is_finite())) {
         return None;

@@ -1,4 +1,4 @@
-//! Every built-in motion model and life, through the layer, against f64 finite differences.
+//! Every built-in motion model and lifespan, through the layer, against f64 finite differences.
 
 use super::*;
 use crate::motion::{SpacetimeSpec, Spec, build_as};
@@ -196,14 +196,14 @@ fn infinite_life_equals_still_without_one() {
     let a = layer(&Spec::Still, LifeKind::Infinite, 10, 2);
     let (mut tape, mut ids) = (LayerTape::default(), Vec::new());
     assert!(a.active(Time(5.0), &mut ids));
-    tape.ask_active(&a, Time(5.0));
+    tape.request_active(&a, Time(5.0));
     a.at(&Cache::default(), &mut tape);
     let base = crate::motion::still::activate(a.params[GEOMETRY].read::<11>(3, 0));
     assert_eq!(tape.out().read::<10>(3, 0), base);
 }
 
 #[test]
-fn a_layer_is_seen_in_its_span_only() {
+fn a_layer_is_visible_in_its_span_only() {
     let mut a = layer(&Spec::Still, LifeKind::Infinite, 5, 1);
     let mut b = layer(&Spec::Still, LifeKind::GaussHalf, 20, 2);
     let whole = b.spans();
@@ -229,7 +229,7 @@ fn a_layer_is_seen_in_its_span_only() {
     assert_eq!(scene.splats(&instant).len(), 8);
 }
 
-/// A layer whose Gaussians move, turn and have their own lives, in a frame of its own.
+/// A layer whose Gaussians move, turn and have their own lifespans, in a frame of its own.
 fn turning() -> Scene<f32> {
     let mut params = Params::<f32>::new(40, 4, LifeKind::GaussHalf.columns());
     let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };

@@ -1,4 +1,4 @@
-//! Where one set of cameras stands in the world of another, and how far they are apart there.
+//! Alignment of one set of cameras with another, and their distances after it.
 
 use super::mat3::procrustes;
 use super::se3::{dot, mat_mul, mat_vec, norm, sub, transpose};
@@ -16,7 +16,8 @@ fn mean(points: &[[f64; 3]]) -> [f64; 3] {
     points.iter().fold([0.0; 3], |sum, p| std::array::from_fn(|k| sum[k] + p[k] / n))
 }
 
-/// The similarity of least squares that takes points to others (Umeyama 1991). `None`: fewer than two, or all in one place.
+/// The similarity of least squares that takes points to others (Umeyama 1991). `None`: fewer than two, or all in one
+/// position.
 /// Panics: not as many points as others.
 pub fn similarity(from: &[[f64; 3]], to: &[[f64; 3]]) -> Option<Sim3> {
     assert_eq!(from.len(), to.len(), "every point has one that it is taken to");
@@ -52,7 +53,8 @@ pub struct Apart {
     pub center: f64,
 }
 
-/// How far cameras are from their truth, once the similarity between their centres is taken away. `None`: there is none.
+/// How far cameras are from their truth, once the similarity between their centres is taken away. `None`: there is
+/// none.
 pub fn apart(poses: &[Se3], truth: &[Se3]) -> Option<Vec<Apart>> {
     Trajectory::of(poses, truth, &[]).map(|t| t.apart)
 }
@@ -68,14 +70,15 @@ pub struct Trajectory {
     pub radius: f64,
     /// Absolute trajectory error: root mean square distance of centres, true units.
     pub ate: f64,
-    /// Relative pose error, root mean square over pairs: of the motion from one camera to the next, its rotation in degrees
-    /// and its translation in true units. `None`: there are no pairs.
+    /// Relative pose error, root mean square over pairs: of the motion from one camera to the next, its rotation in
+    /// degrees and its translation in true units. `None`: there are no pairs.
     pub rpe: Option<[f64; 2]>,
 }
 
 impl Trajectory {
-    /// Compares poses with their truth; `pairs` of cameras are neighbours on a path. `None`: no similarity leads from one to
-    /// the other, since there are fewer than two centres or they are all in one place. Panics: not as many poses as truths.
+    /// Compares poses with their truth; `pairs` of cameras are neighbours on a path. `None`: no similarity leads from
+    /// one to the other, since there are fewer than two centres or they are all at one point. Panics: not as many poses
+    /// as truths.
     pub fn of(poses: &[Se3], truth: &[Se3], pairs: &[[usize; 2]]) -> Option<Self> {
         let centers = |p: &[Se3]| p.iter().map(|q| q.inverse().translation).collect::<Vec<_>>();
         let (from, to) = (centers(poses), centers(truth));

@@ -57,7 +57,7 @@ mod tests {
     use crate::math::Rng;
 
     #[test]
-    fn equations_are_solved_and_what_is_not_positive_definite_is_refused() {
+    fn equations_are_solved_unless_not_positive_definite() {
         let (n, rng) = (6, Rng::new(1, "cholesky", 0));
         let b: Vec<f64> = (0..n * n).map(|k| rng.normal(200 + k as u64)).collect();
         let at = |i: usize, j: usize| (0..n).map(|k| b[i * n + k] * b[j * n + k]).sum::<f64>();

@@ -12,7 +12,7 @@ pub fn twiddles<F: Real>(n: usize) -> Vec<[F; 2]> {
     (0..n / 2).map(|k| [F::of((step * k as f64).cos()), F::of((step * k as f64).sin())]).collect()
 }
 
-/// The place of value `i` of `n`, a power of two, in the order in which [`butterflies`] takes them: reversed bits.
+/// The position of value `i` of `n`, a power of two, in the order in which [`butterflies`] takes them: reversed bits.
 #[inline]
 pub fn reversed(i: usize, n: usize) -> usize {
     match n.trailing_zeros() {

@@ -10,7 +10,7 @@ pub fn halve<F: Real>(data: &mut Vec<F>, [channels, height, width]: [usize; 3]) 
         for y in 0..rows {
             let (from, to) = ((c * height + 2 * y) * width, (c * rows + y) * columns);
             for x in 0..columns {
-                // A pixel of the half image is written before the places that later ones read.
+                // A pixel of the half image is written before those that later ones read.
                 let [a, b] = [from + 2 * x, from + width + 2 * x];
                 data[to + x] = quarter * (data[a] + data[a + 1] + data[b] + data[b + 1]);
             }

@@ -1,4 +1,4 @@
-//! Exact nearest neighbours by a balanced k-d tree; first scales and neighbour lists come from here.
+//! Exact nearest neighbours by a balanced k-d tree; used for initial scales and neighbour lists.
 
 use rayon::prelude::*;
 
@@ -9,10 +9,10 @@ const SCALE_NEIGHBOURS: usize = 3;
 
 /// The `k` nearest other points of every point, nearest first.
 ///
-/// Shapes: points `[N,3]` → `[N,k]` row-major. Exact; equal distances are ordered by index, so the result does not depend
-/// on threads. Distances are those of f32 arithmetic. A point is never its own neighbour, but copies of it are; where there
-/// are fewer than k others, the row is filled up with the point's own index (a pair that no smoothness term feels).
-/// A NaN coordinate counts as infinitely far. Cost: O(N log N) also when many points coincide.
+/// Shapes: points `[N,3]` → `[N,k]` row-major. Exact; equal distances are ordered by index, so the result does not
+/// depend on threads. Distances are those of f32 arithmetic. A point is never its own neighbour, but copies of it are;
+/// where there are fewer than k others, the row is filled up with the point's own index (a pair that no smoothness term
+/// feels). A NaN coordinate counts as infinitely far. Cost: O(N log N) also when many points coincide.
 /// Panics: N exceeds u32.
 pub fn knn(points: &[[f32; 3]], k: usize) -> Vec<u32> {
     let found = search(points, k);
@@ -70,7 +70,8 @@ struct Node {
     least: [u32; 2],
 }
 
-/// Level l holds 2^l nodes from place 2^l − 1 on; node i's children are 2i+1 and 2i+2. A range is halved at its middle.
+/// Level l holds 2^l nodes from position 2^l − 1 on; node i's children are 2i+1 and 2i+2. A range is halved at its
+/// middle.
 struct Tree {
     items: Vec<Item>,
     nodes: Vec<Node>,

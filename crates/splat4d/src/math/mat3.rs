@@ -5,15 +5,15 @@ use super::se3::{cross, dot, norm, transpose};
 use super::{Real, quat};
 
 /// Share of the matrix's size that is added along the identity, so that of several equally near rotations (points on a
-/// line or in one place leave some free) the one that turns least is taken. Rounding of f64 is some thousand times
-/// smaller, and the answer elsewhere moves by no more than this.
+/// line or at one point leave some free) the one that turns least is taken. Rounding of f64 is some thousand times
+/// smaller, and the result elsewhere moves by no more than this.
 const LEAST_TURN: f64 = 1e-12;
 /// Sweeps of the Jacobi iteration, at most; it converges quadratically, four or five are usual for 4x4.
 const SWEEPS: usize = 12;
 
 /// Solves a x = b by Cramer's rule; `None` where a is nearly singular, whatever its unit.
 pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
-    /// Of the product of the rows' lengths, which the determinant reaches where rows stand at right angles.
+    /// Of the product of the rows' lengths, which the determinant reaches where rows are at right angles.
     const SINGULAR: f64 = 1e-12;
     let columns = transpose(&a);
     let det = dot(columns[0], cross(columns[1], columns[2]));
@@ -31,7 +31,7 @@ pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
 /// The rotation R (det +1, never a reflection) that maximises Σ_ij R_ij cov_ij, so that for cov = Σ w a bᵀ it minimises
 /// Σ w ‖a − R b‖² (the orthogonal Procrustes or Wahba problem).
 ///
-/// Points on a line or in one place leave a choice: of the nearest rotations it is the one that turns least; the zero
+/// Points on a line or at one point leave a choice: of the nearest rotations it is the one that turns least; the zero
 /// matrix gives the identity, and so does one that is not finite. Computed in f64: the unit quaternion of the largest
 /// eigenvalue of Davenport's 4x4 matrix, by cyclic Jacobi rotations.
 /// Source: Davenport 1968; Horn 1987, "Closed-form solution of absolute orientation using unit quaternions".
@@ -150,7 +150,7 @@ mod tests {
             let error =
                 r.as_flattened().iter().zip(identity.as_flattened()).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
             assert!(error < 1e-3, "{error}");
-            // In a plane the answer is one, without a reflection.
+            // In a plane the result is one, without a reflection.
             let w = random("plane", i)[0];
             let r = procrustes(std::array::from_fn(|k| std::array::from_fn(|l| v[k] * v[l] + w[k] * w[l])));
             let error =

@@ -27,8 +27,8 @@ pub fn normalize_backward<F: Real>(unit: [F; 4], norm: F, d_unit: [F; 4]) -> [F;
     std::array::from_fn(|i| (d_unit[i] - unit[i] * along) / norm)
 }
 
-/// The raw quaternion q of a shape after a rotation: rotation ⊗ q, rounded once. A zero q stands for the identity wherever
-/// it is used, and rotates as the identity does.
+/// The raw quaternion q of a shape after a rotation: rotation ⊗ q, rounded once. A zero q represents the identity
+/// wherever it is used, and rotates as the identity does.
 pub(crate) fn rotated<F: Real>(rotation: [f64; 4], q: [F; 4]) -> [F; 4] {
     let q = if q == [F::ZERO; 4] { [1.0, 0.0, 0.0, 0.0] } else { q.map(|x| x.f64()) };
     product(rotation, q).map(F::of)

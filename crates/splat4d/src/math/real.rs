@@ -64,7 +64,7 @@ pub trait Real:
     fn max(self, other: Self) -> Self;
     /// Neither NaN nor infinite.
     fn is_finite(self) -> bool;
-    /// self·b + c, fused only where the instruction set has it (the caller states so by `FMA`).
+    /// self·b + c, fused only where the instruction set has it (the caller sets `FMA`).
     fn fma<const FMA: bool>(self, b: Self, c: Self) -> Self;
     /// 2^self for self in [-126, 0]: a branch-free polynomial in f32 (relative error ≤ 5e-6, 1 only at 0), exact in
     /// f64. Below the range the result is any number.
@@ -169,8 +169,8 @@ const EXP2_MINIMAX: [f32; 4] = [0.693_124_196, 0.240_240_984, 0.055_906_423, 0.0
 /// Bits of an f32 below its exponent.
 const MANTISSA_BITS: u32 = f32::MANTISSA_DIGITS - 1;
 
-/// Adding and subtracting 1.5·2^23 rounds a number below 2^22 to an integer without a branch; in between, the low bits of
-/// the sum hold that integer in two's complement.
+/// Adding and subtracting 1.5·2^23 rounds a number below 2^22 to an integer without a branch; in between, the low bits
+/// of the sum hold that integer in two's complement.
 const ROUND: f32 = 12_582_912.0;
 /// ln 2 as a short number, whose product with an exponent is exact, and the rest (Cody and Waite 1980).
 const LN2: [f32; 2] = [0.693_359_375, -2.121_944_4e-4];

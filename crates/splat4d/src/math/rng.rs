@@ -30,7 +30,7 @@ impl Rng {
         Self { key: mix(self.key ^ index.wrapping_mul(0xD134_2543_DE82_EF95)) }
     }
 
-    /// What the stream is made of, for its twin on a GPU (gpu/numbers.wgsl).
+    /// State of the stream, for its twin on a GPU (gpu/numbers.wgsl).
     #[cfg(feature = "gpu")]
     pub(crate) fn key(self) -> u64 {
         self.key

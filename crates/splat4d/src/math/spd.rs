@@ -8,9 +8,10 @@
 //! | exp | ΓΣ₁ + Σ₁Γ = V; μ₁ + v, (I+Γ)Σ₁(I+Γ) |
 //! | geodesic | (1−s)μ₁ + sμ₂, MΣ₁M with M = (1−s)I + sT |
 //!
-//! No gradient goes through eigenvectors, which jump where eigenvalues meet: roots and maps are differentiated through
-//! the equations they solve. All is in f64: one Gaussian is some hundred operations in registers, and products of two
-//! nearly flat covariances have condition numbers that 32 bits cannot hold. What was stored in 32 bits is widened.
+//! No gradient is propagated through eigenvectors, which jump where eigenvalues meet: roots and maps are differentiated
+//! through the equations they solve. All is in f64: one Gaussian is some hundred operations in registers, and products
+//! of two nearly flat covariances have condition numbers that 32 bits cannot hold. What was stored in 32 bits is
+//! widened.
 //!
 //! Source: Deng et al. 2024 (Wasserstein 4DGS); Malagò et al. 2018, "Wasserstein Riemannian geometry of Gaussian
 //! densities", for log, exp and Lyapunov's equation.
@@ -20,7 +21,7 @@ mod tests;
 
 use super::Real;
 
-/// A 3x3 matrix, row by row; symmetric unless said otherwise.
+/// A 3x3 matrix, row by row; symmetric unless stated otherwise.
 pub type Mat3 = [[f64; 3]; 3];
 
 /// 1
@@ -33,8 +34,8 @@ pub(crate) const RELATIVE_FLOOR: f64 = 1e-8;
 const ABSOLUTE_FLOOR: f64 = 1e-20;
 /// Eigenvalues of a product of two covariances have twice the exponents.
 const PRODUCT_FLOOR: f64 = RELATIVE_FLOOR * RELATIVE_FLOOR;
-/// I + Γ is clamped to this from below when it leads out of the space of Gaussians (our choice): a step never shrinks an
-/// axis to less than a tenth.
+/// I + Γ is clamped to this from below when it leads out of the space of Gaussians (our choice): a step never shrinks
+/// an axis to less than a tenth.
 pub(crate) const STRETCH_MIN: f64 = 0.1;
 /// Sweeps of Jacobi rotations: convergence is quadratic, six suffice for f64.
 const SWEEPS: usize = 8;
@@ -61,7 +62,7 @@ pub(crate) fn unpack_gradient<F: Real>(g: [F; 6]) -> Mat3 {
     unpack([g[0], g[1] * h, g[2] * h, g[3], g[4] * h, g[5]])
 }
 
-/// A gradient to a symmetric matrix, as that to its six numbers: each off-diagonal stands in two places.
+/// A gradient to a symmetric matrix, as that to its six numbers: each off-diagonal is in two places.
 #[inline]
 pub(crate) fn pack_gradient<F: Real>(g: &Mat3) -> [F; 6] {
     [g[0][0], g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][1], g[1][2] + g[2][1], g[2][2]].map(F::of)

@@ -19,7 +19,7 @@ pub fn from_quat_log_scales<F: Real>(q: [F; 4], log_scales: [F; 3]) -> [F; 6] {
 
 /// VJP of [`from_quat_log_scales`]: (d_quat, d_log_scales).
 ///
-/// `d_cov` is the gradient to the six packed numbers, so that an off-diagonal holds the sum over both of its places.
+/// `d_cov` is the gradient to the six packed numbers, so that an off-diagonal holds the sum over both of its positions.
 #[inline(always)]
 pub(crate) fn from_quat_log_scales_backward<F: Real>(q: [F; 4], log_scales: [F; 3], d_cov: [F; 6]) -> ([F; 4], [F; 3]) {
     let (unit, norm) = quat::normalize(q);
@@ -85,7 +85,7 @@ pub fn largest(m: [f64; 6]) -> f64 {
     mean + 2.0 * p * angle.cos()
 }
 
-/// A unit quaternion and log scales with this covariance: the way from any activated Gaussian back to a learnable one.
+/// A unit quaternion and log scales with this covariance: from any activated Gaussian to a learnable one.
 ///
 /// Eigenvalues below `floor²` are lifted to it.
 pub fn to_quat_log_scales(cov: [f64; 6], floor: f64) -> ([f64; 4], [f64; 3]) {

@@ -6,7 +6,7 @@
 use super::Real;
 use super::vec3::{cross, dot};
 
-/// Below this |w|² the coefficients come from their series, whose next term is then below 1e-13.
+/// Below this |w|² the coefficients are computed by their series, whose next term is then below 1e-13.
 const SERIES: f64 = 1.0;
 /// Terms of the series.
 const TERMS: usize = 8;

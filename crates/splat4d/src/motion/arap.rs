@@ -1,10 +1,10 @@
 //! Dragging control nodes, as rigidly as possible: some nodes are put somewhere, and all others follow so that every
 //! neighbourhood keeps its shape.
 //!
-//! Minimises E = Σ_k Σ_j∈N(k) w_kj ‖(p'_k − p'_j) − R_k (p_k − p_j)‖² over positions p' and rotations R by turns: the best
-//! rotation of every neighbourhood (Procrustes), then the best positions, Σ_j w_kj (p'_k − p'_j) =
-//! ½ Σ_j w_kj (R_k + R_j)(p_k − p_j), by conjugate gradients with the handles' rows eliminated. Neither step can raise E.
-//! Weights are symmetric, so that the matrix is. Everything is f64 and in a fixed order.
+//! Minimises E = Σ_k Σ_j∈N(k) w_kj ‖(p'_k − p'_j) − R_k (p_k − p_j)‖² over positions p' and rotations R by turns: the
+//! best rotation of every neighbourhood (Procrustes), then the best positions, Σ_j w_kj (p'_k − p'_j) = ½ Σ_j w_kj (R_k
+//! + R_j)(p_k − p_j), by conjugate gradients with the handles' rows eliminated. Neither step can raise E. Weights are
+//! symmetric, so that the matrix is. Everything is f64 and in a fixed order.
 //! Source: Sorkine and Alexa 2007; graph as SC-GS (Huang et al. 2024), whose weights are not symmetric.
 
 use super::skin::{POSE, POSE_COLUMNS};
@@ -18,10 +18,10 @@ use rayon::prelude::*;
 
 /// Neighbours of a node (SC-GS).
 pub(crate) const NEIGHBOURS: usize = 10;
-/// Of them the nearest so many always count, the others only within [`REACH`] (SC-GS).
+/// Of them the nearest this many always count, the others only within [`REACH`] (SC-GS).
 const SURE_NEIGHBOURS: usize = 3;
-/// Length of an edge beyond the third, of the median distance to the third neighbour: farther nodes are those of another
-/// limb (ours; SC-GS has 0.3 scene units).
+/// Length of an edge beyond the third, of the median distance to the third neighbour: farther nodes are those of
+/// another limb (ours; SC-GS has 0.3 scene units).
 const REACH: f64 = 2.0;
 /// Conjugate gradients stop at this share of the first residual: energies then fall to the last digits that matter.
 const CG_TOLERANCE: f64 = 1e-9;
@@ -35,16 +35,16 @@ const TASK_NODES: usize = 64;
 pub struct Handle {
     /// Its number.
     pub node: usize,
-    /// Where it goes, scene units.
+    /// Target position, scene units.
     pub target: [f64; 3],
-    /// How it turns (rows), for handles with six degrees of freedom; `None`: as its neighbours want.
+    /// How it turns (rows), for handles with six degrees of freedom; `None`: as its neighbours require.
     pub rotation: Option<[[f64; 3]; 3]>,
 }
 
 /// The result of a drag.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dragged {
-    /// Where every node is now.
+    /// Current positions of the nodes.
     pub positions: Vec<[f64; 3]>,
     /// How every node has turned (rows).
     pub rotations: Vec<[[f64; 3]; 3]>,
@@ -53,7 +53,8 @@ pub struct Dragged {
 }
 
 impl Dragged {
-    /// Shifts from `from` and quaternion residuals, [nodes, 7]: what [`Skinned::with_offsets`](super::skin::Skinned) takes.
+    /// Shifts from `from` and quaternion residuals, [nodes, 7]: what [`Skinned::with_offsets`](super::skin::Skinned)
+    /// takes.
     pub fn poses<F: Real>(&self, from: &[[f64; 3]]) -> Table<F> {
         let mut out = Table::new(&POSE_COLUMNS, self.positions.len());
         for (k, (p, r)) in self.positions.iter().zip(&self.rotations).enumerate() {
@@ -71,7 +72,7 @@ impl Dragged {
 
 /// Drags `handles` of nodes at `rest`, with `iterations` rounds (SC-GS: 3). See `Elastic` to drag the same nodes again.
 ///
-/// Errors: a handle that is no node or stands twice, a target that is not finite.
+/// Errors: a handle that is not a node or occurs twice, a target that is not finite.
 pub fn drag(rest: &[[f64; 3]], handles: &[Handle], iterations: usize) -> Result<Dragged> {
     Elastic::new(rest).drag(handles, iterations)
 }
@@ -141,13 +142,13 @@ impl Elastic {
 
     /// Puts handles where they belong and lets all others follow. Parts without a handle stay.
     ///
-    /// Errors: a handle that is no node or stands twice, a target that is not finite.
+    /// Errors: a handle that is not a node or occurs twice, a target that is not finite.
     pub(crate) fn drag(&self, handles: &[Handle], iterations: usize) -> Result<Dragged> {
         let n = self.len();
         let mut held: Vec<Option<Handle>> = vec![None; n];
         for h in handles {
             if h.node >= n || held[h.node].is_some() {
-                return Err(Error::input(format!("handle {} is not one of {n} nodes, or stands twice", h.node))
+                return Err(Error::input(format!("handle {} is not one of {n} nodes, or is given twice", h.node))
                     .remedy("Give every node at most one target"));
             }
             let turns = h.rotation.iter().flatten().flatten();
@@ -208,11 +209,11 @@ impl Elastic {
         (0..self.len()).into_par_iter().with_min_len(TASK_NODES).map(one).collect()
     }
 
-    /// The global step: positions of the free nodes for given rotations, from where they are (conjugate gradients with the
-    /// diagonal as preconditioner).
+    /// The global step: positions of the free nodes for given rotations, from where they are (conjugate gradients with
+    /// the diagonal as preconditioner).
     fn settle(&self, rotations: &[[[f64; 3]; 3]], free: &[bool], x: &mut [[f64; 3]]) {
         let nodes: Vec<usize> = (0..self.len()).filter(|&k| free[k]).collect();
-        // Residual b − A x of the free rows; what is held stands in x and so on the right-hand side.
+        // Residual b − A x of the free rows; what is held is in x and so on the right-hand side.
         let mut r = vec![[0.0; 3]; self.len()];
         let mut diagonal = vec![1.0; self.len()];
         for &k in &nodes {

@@ -1,7 +1,7 @@
 //! `control`: Gaussians skinned to sparse control nodes (Huang et al. 2024, "SC-GS"), which one of several trajectories
 //! drives: a network, keys in time, or a few motions that all nodes share.
 //!
-//! The skin stands in [`super::skin`]; here are the trajectories. Time is the share of the clip that has passed; before and
+//! The skin is in [`super::skin`]; here are the trajectories. Time is the share of the clip that has passed; before and
 //! after the clip nodes rest where they were at its end.
 
 mod keys;

@@ -1,16 +1,15 @@
 //! `deform-mlp`: a canonical cloud that a network deforms.
 //!
-//! With x̂ = (sg(x) − c)/r and t̂ = (t − from)/(to − from) clamped to [0, 1], a network gives every Gaussian
-//! (δx 3, δq 4, δs 3), or with `rigid` a screw (w 3, v 3) in place of δx:
-//! x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t = q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales are
-//! changed after the activation — each head times its constant of `GAINS`. Opacity and SH stay.
-//! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw: turned
-//! by it). The network sees γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or hash grids over
-//! (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases, which is the same
-//! as standing in every row.
-//! At the start the last map is zero: the answer is then the canonical cloud bit for bit, as in `still`.
-//! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024); hash
-//! grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
+//! With x̂ = (sg(x) − c)/r and t̂ = (t − from)/(to − from) clamped to [0, 1], a network gives every Gaussian (δx 3, δq
+//! 4, δs 3), or with `rigid` a screw (w 3, v 3) in place of δx: x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t =
+//! q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales are changed after the activation — each head times its
+//! constant of `GAINS`. Opacity and SH stay. `sg` stops the gradient: the network's input is detached from the mean, so
+//! that dL/dx = dL/dx_t (with a screw: turned by it). The inputs of the network are γ(x̂) and γ(t̂), t̂'s perhaps
+//! through a small network of its own, or hash grids over (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends
+//! on t̂ alone enters as a shift of biases, which is the same as repeating it in every row. At the start the last map
+//! is zero: the result is then the canonical cloud bit for bit, as in `still`.
+//! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024);
+//! hash grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
 
 mod rows;
 #[cfg(test)]
@@ -43,7 +42,7 @@ pub struct DeformSpec {
     pub width: usize,
     /// Hidden layers of the trunk; 0: features are mapped linearly.
     pub layers: usize,
-    /// The input stands again behind what this hidden layer (from 0) gives.
+    /// The input is appended again to the output of this hidden layer (from 0).
     pub skip: Option<usize>,
     /// Whether positions move by a screw motion instead of an offset.
     pub rigid: bool,
@@ -59,7 +58,7 @@ pub enum Input {
         x_levels: usize,
         /// Levels of t̂.
         t_levels: usize,
-        /// Whether γ(t̂) goes through a small network first (`TIME_WIDTH` → `TIME_OUTPUTS`).
+        /// Whether γ(t̂) passes through a small network first (`TIME_WIDTH` → `TIME_OUTPUTS`).
         time_net: bool,
     },
     /// Hash grids.
@@ -71,7 +70,7 @@ pub enum Input {
     },
 }
 
-/// Hidden numbers of the network that only sees time (Yang et al. 2024, synthetic scenes).
+/// Hidden width of the network of time alone (Yang et al. 2024, synthetic scenes).
 pub(crate) const TIME_WIDTH: usize = 256;
 /// Number of its outputs, which the trunk gets.
 pub(crate) const TIME_OUTPUTS: usize = 30;
@@ -81,7 +80,7 @@ const TIME_AXES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 const POINT: usize = 4;
 /// Name of the table that holds the centre and the half side of the box of the initial cloud, scene units.
 pub(crate) const BOUNDS: &str = "deform_bounds";
-/// Share of the points that may lie outside the box on either side of an axis.
+/// Share of the points that may be outside the box on either side of an axis.
 const OUTSIDE: f64 = 0.005;
 /// The box is this much larger than what holds the points.
 const MARGIN: f64 = 1.25;
@@ -107,7 +106,7 @@ enum Eyes {
     Encoded {
         x_levels: usize,
         t_levels: usize,
-        /// γ(t̂) → what the shifts are made of.
+        /// γ(t̂) → the inputs of the shifts.
         time: Option<Mlp>,
         /// → the shift of the trunk's first map.
         enter: Mlp,
@@ -128,19 +127,19 @@ pub struct Deform {
     trunk: Mlp,
 }
 
-/// State that one answer keeps for its backward.
+/// State that one result keeps for its backward.
 #[derive(Debug)]
 struct Own<F> {
-    /// Whether the network was asked.
+    /// Whether the network was queried.
     asked: bool,
-    /// Whether its answer is used: false where the last map is zero.
+    /// Whether its result is used: false where the last map is zero.
     moves: bool,
     /// [rows, inputs] of the trunk.
     x: Vec<F>,
     /// [rows, 4]: x̂ and t̂ in [0, 1], for grids.
     points: Vec<F>,
     shifts: Vec<Vec<F>>,
-    /// γ(t̂), and what the shifts are made of.
+    /// γ(t̂), and the inputs of the shifts.
     time: [Vec<F>; 2],
     kept: LayerOutputs<F>,
     time_kept: LayerOutputs<F>,
@@ -254,7 +253,7 @@ impl Deform {
     fn unit_time(&self, t: Time) -> (f64, f64) {
         let [from, to] = self.spec.clip;
         let length = to - from;
-        // A NaN becomes 0 here; nothing else of the model knows the time.
+        // A NaN becomes 0 here; nothing else of the model depends on time.
         if length > 0.0 && t.0 > from {
             if t.0 >= to { (1.0, 0.0) } else { ((t.0 - from) / length, 1.0 / length) }
         } else {
@@ -267,7 +266,7 @@ impl Deform {
         Bounds { center: [b[0], b[1], b[2]], radius: b[3], rigid: self.spec.rigid }
     }
 
-    /// Asks the network for every row of the question.
+    /// Evaluates the network for every row of the query.
     fn request<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>) {
         let (n, bounds, t) = (q.len(), self.bounds(q.p), F::of(self.unit_time(q.t).0));
         let geometry = &q.p[GEOMETRY];
@@ -326,7 +325,7 @@ impl Deform {
     }
 
     /// The VJP of [`ask`](Self::request) from `own.d_heads`; returns dL/dt.
-    fn ask_backward<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>, d: &mut Grads<F>) -> f64 {
+    fn request_backward<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>, d: &mut Grads<F>) -> f64 {
         let slope = self.unit_time(q.t).1;
         let Own { x, shifts, kept, d_heads, .. } = &*own;
         match &self.eyes {
@@ -359,7 +358,7 @@ impl Deform {
                 own.d_points.resize(own.points.len(), F::ZERO);
                 let mut first = 0;
                 for (i, grid) in grids.iter().enumerate() {
-                    // The grid over space does not know the time, and x̂ is detached.
+                    // The grid over space does not depend on time, and x̂ is detached.
                     let d_points = (i > 0 && slope != 0.0).then_some(own.d_points.as_mut_slice());
                     grid.backward(q.p, &own.points, (&own.d_x, first, inputs), d_points, d);
                     first += grid.shape().outputs();
@@ -369,7 +368,7 @@ impl Deform {
         }
     }
 
-    /// Whether everything that comes out is zero.
+    /// Whether all outputs are zero.
     fn rests<F: Real>(&self, p: &Params<F>) -> bool {
         let shifted = self.spec.layers == 0 && matches!(&self.eyes, Eyes::Encoded { enter, .. } if !enter.is_zero(p));
         !shifted && self.trunk.is_zero(p)
@@ -381,7 +380,8 @@ impl<F: Real> Motion<F> for Deform {
         Spec::DeformMlp(self.spec.clone())
     }
 
-    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`LayerOutputs`] keeps.
+    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`LayerOutputs`]
+    /// keeps.
     fn scratch_bytes(&self, _p: &Params<F>, rows: usize) -> u64 {
         let shape = self.trunk.shape();
         let number = size_of::<F>();
@@ -443,6 +443,6 @@ impl<F: Real> Motion<F> for Deform {
         let _ = scatter(&Spread(&own.d_rows), d.of([GEOMETRY]), q.rows);
         own.d_heads.resize(n * width, F::ZERO);
         Gather { d_rows: &own.d_rows, width }.run(&mut own.d_heads);
-        self.ask_backward(q, own, d)
+        self.request_backward(q, own, d)
     }
 }

@@ -1,7 +1,7 @@
-//! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed place, other
-//! colours, a fade, a drag of control nodes. Changes on changes are models around models.
+//! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed position,
+//! other colours, a fade, a drag of control nodes. Changes on changes are models around models.
 //!
-//! | change | answer at t, from the answer inside |
+//! | change | result at t, from the inner result |
 //! |---|---|
 //! | `clock` | that at s = rate·t + offset |
 //! | `path` | μ' = A(t) μ + b(t), Σ' = A Σ Aᵀ, colours turn along; A = scale times rotation |
@@ -9,8 +9,8 @@
 //! | `fade` | opacity times a factor of t |
 //! | `drag` | μ' = M μ + b, Σ' = Q Σ Qᵀ, blended of the node offsets that pull the Gaussian ([`DragSpec`]) |
 //!
-//! Lives are the layer's: who gives a model a clock gives the layer's lives the same. Nodes are answered by the model inside.
-//! Gradients pass through to the tables inside; the changes themselves are not learnt.
+//! Lifespans are the layer's: a clock for the model must also be given to the layer's lifespans. Nodes are evaluated by
+//! the model inside. Gradients pass through to the tables inside; the changes themselves are not learnt.
 
 mod color;
 mod drag;
@@ -45,7 +45,7 @@ const STEP: f64 = 1.0 / 30_000.0;
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 #[non_exhaustive]
 pub enum Change {
-    /// The model is asked at s = rate·t + offset.
+    /// The model is queried at s = rate·t + offset.
     Clock {
         /// Seconds inside a second outside; below zero: backwards; never zero.
         rate: f64,
@@ -93,7 +93,7 @@ impl Change {
         }
     }
 
-    /// Whether the answer depends on t next to the model's own.
+    /// Whether the result depends on t next to the model's own.
     fn moves(&self) -> bool {
         match self {
             Change::Clock { .. } | Change::Color { .. } => false,
@@ -139,7 +139,7 @@ fn capabilities(inner: Capabilities, change: &Change) -> Capabilities {
     let backwards = matches!(change, Change::Clock { rate, .. } if *rate < 0.0);
     let turns = matches!(change, Change::Path { .. } | Change::Drag(_)) && change.moves();
     Capabilities {
-        // What does not move is taken from its tables, which say nothing of a change.
+        // What does not move is taken from its tables, which carry no information about a change.
         moves: inner.moves || !matches!(change, Change::Clock { .. }),
         rotates: inner.rotates || turns,
         causal: inner.causal && !backwards,
@@ -151,11 +151,11 @@ fn capabilities(inner: Capabilities, change: &Change) -> Capabilities {
 pub(crate) struct Edited<F: Real = f32> {
     inner: Arc<dyn Motion<F>>,
     change: Change,
-    /// Where a drag has its numbers.
+    /// Location of a drag's numbers.
     drag: Option<drag::Keys>,
 }
 
-/// How an answer is placed at one time.
+/// How a result is placed at one time.
 enum Placed<'a, F> {
     Same,
     All(Affine<F>),
@@ -170,7 +170,7 @@ struct Affine<F> {
     q: [[F; 3]; 3],
 }
 
-/// State of an answer.
+/// State of a result.
 struct Own<F> {
     inner: Tape<F>,
     /// Colours where they are others than the model's.
@@ -212,7 +212,7 @@ impl<F: Real> Edited<F> {
         &self.change
     }
 
-    /// Writes the numbers of a drag into its tables. Panics: the change is no drag, or has another shape.
+    /// Writes the numbers of a drag into its tables. Panics: the change is not a drag, or has another shape.
     pub(crate) fn fill_drag(&self, from: &NodeOffsets, p: &mut Params<F>) {
         let (Change::Drag(spec), Some(keys)) = (&self.change, &self.drag) else { panic!("this edit drags nothing") };
         keys.fill(spec, from, p);
@@ -223,7 +223,7 @@ impl<F: Real> Edited<F> {
         Self { inner, change, drag: self.drag }
     }
 
-    /// The question to the model inside.
+    /// The query to the model inside.
     fn inside<'a>(&self, q: &At<'a, F>) -> At<'a, F> {
         match self.change {
             Change::Clock { rate, offset } => At { t: Time(rate * q.t.0 + offset), ..*q },
@@ -231,7 +231,7 @@ impl<F: Real> Edited<F> {
         }
     }
 
-    /// Whether the answer inside is the answer.
+    /// Whether the result inside is the result.
     fn passes(&self, q: &At<'_, F>) -> bool {
         q.of != Space::Gaussians || matches!(self.change, Change::Clock { .. })
     }
@@ -274,7 +274,7 @@ impl<F: Real> Edited<F> {
         });
     }
 
-    /// Colours of the answer `inner` as the change has them at time t; leaves `out` empty where they are the model's own.
+    /// Colours of the result `inner` after the change at time t; leaves `out` empty where they are the model's own.
     fn paint(&self, q: &At<'_, F>, t: f64, inner: &Tape<F>, out: &mut Table<F>) {
         if !self.change.paints() {
             return;
@@ -311,8 +311,8 @@ impl<F: Real> Edited<F> {
         Some(sh_rotation(&path::at(*about, keys, t).rotation))
     }
 
-    /// The VJP of [`paint`](Self::paint): adds dL/d(SH) where the table is the layer's own, fills what goes to the model
-    /// inside otherwise.
+    /// The VJP of [`paint`](Self::paint): adds dL/d(SH) where the table is the layer's own, fills what goes to the
+    /// model inside otherwise.
     fn paint_back(
         &self,
         q: &At<'_, F>,
@@ -364,7 +364,7 @@ impl<F: Real> Edited<F> {
         (d_color, d_weights)
     }
 
-    /// Σ d_out · ∂out/∂t at a fixed answer inside, by central differences.
+    /// Σ d_out · ∂out/∂t at a fixed inner result, by central differences.
     fn d_time(&self, q: &At<'_, F>, own: &Own<F>, d_out: &SplatGrads<'_, F>) -> f64 {
         if !self.change.moves() {
             return 0.0;
@@ -479,7 +479,7 @@ impl<F: Real> Motion<F> for Edited<F> {
         Some(Arc::new(self.with(self.inner.with_phase(phase)?, self.change.clone())))
     }
 
-    /// Those of the model inside, its answer and its colours.
+    /// Those of the model inside, its result and its colours.
     fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
         self.inner.scratch_bytes(p, rows) + (rows * (2 * WIDTH + p[SH].width()) * size_of::<F>()) as u64
     }
@@ -544,7 +544,7 @@ impl<F: Real> Motion<F> for Edited<F> {
                 if let Some(a) = placed.of(q.rows.id(j)) {
                     let g = [row[0], row[1], row[2]];
                     let mean: [F; 3] = std::array::from_fn(|i| (0..3).map(|k| a.m[k][i] * g[k]).sum());
-                    // An off-diagonal's gradient stands for both of its places.
+                    // An off-diagonal's gradient represents both of its positions.
                     let h = F::HALF;
                     let [xx, xy, xz, yy, yz, zz]: [F; 6] = std::array::from_fn(|k| row[COV + k]);
                     let back = congruence(&transposed(&a.q), [xx, h * xy, h * xz, yy, h * yz, zz]);

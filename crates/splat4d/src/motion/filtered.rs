@@ -1,20 +1,20 @@
 //! `filtered`: a Kalman-like filter in Wasserstein geometry around any model.
 //!
-//! The answer of the model inside at t is an observation Nₒ. From its answers one frame (and one baseline more) earlier
-//! follows a prediction Nₚ at constant velocity, Exp(−Log) (see [`Predictor`]). The state that is drawn is between:
+//! The result of the model inside at t is an observation Nₒ. From its results one frame (and one baseline more) earlier
+//! follows a prediction Nₚ at constant velocity, Exp(−Log) (see [`Predictor`]). The state that is rendered is between:
 //!
 //! | fusion | state |
 //! |---|---|
-//! | `geodesic` | μ = μₚ + κ(μₒ−μₚ), Σ at κ on the geodesic from Σₚ to Σₒ; κ = 1 − w(1−K), K learnt, one a Gaussian |
-//! | `literal` | K = Σₚ(Σₚ+Σₒ+εI)⁻¹, μ = μₚ + K(μₒ−μₚ), Σ = (I−K)Σₚ, as far as w goes |
+//! | `geodesic` | μ = μₚ + κ(μₒ−μₚ), Σ at κ on the geodesic from Σₚ to Σₒ; κ = 1 − w(1−K), K learnt, one per Gaussian |
+//! | `literal` | K = Σₚ(Σₚ+Σₒ+εI)⁻¹, μ = μₚ + K(μₒ−μₚ), Σ = (I−K)Σₚ, scaled by w |
 //!
 //! w = trust · gate. Trust rises from 0 to 1 over the frame in which the clip has become long enough to predict from;
-//! the gate closes where the innovation δᵀ(Σₚ+Σₒ)⁻¹δ leaves what chance explains, so that a sudden motion is followed at
-//! once. All is continuous in t, between frames too. With `history` the earlier states are filtered themselves,
-//! that many frames back: sequential inference with random access. Opacity and colour are the observation's.
+//! the gate closes where the innovation δᵀ(Σₚ+Σₒ)⁻¹δ leaves what chance explains, so that a sudden motion is followed
+//! at once. All is continuous in t, between frames too. With `history` the earlier states are filtered themselves, that
+//! many frames back: sequential inference with random access. Opacity and colour are the observation's.
 //!
-//! Gradients: exact, through all of `history`; with `stop_gradient` (the default) earlier answers are constants. Nodes are
-//! answered by the model inside.
+//! Gradients: exact, through all of `history`; with `stop_gradient` (the default) earlier results are constants. Nodes
+//! are evaluated by the inner model.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS", arXiv 2412.00333); the scalar gain, the geodesic fusion, the gate's
 //! fading and the baseline are ours.
@@ -38,9 +38,9 @@ use std::sync::Arc;
 
 /// χ² with three degrees of freedom is larger once in a hundred times.
 pub(crate) const GATE: f64 = 11.3;
-/// Most frames between the two states that a velocity is taken from: half a second at 30 frames a second.
+/// Most frames between the two states that a velocity is taken from: half a second at 30 frames per second.
 pub const MAX_BASELINE: usize = 16;
-/// Most frames of history: two seconds at 30 frames a second; every one is an answer of the model inside.
+/// Most frames of history: two seconds at 30 frames per second; every one is a result of the model inside.
 pub const MAX_HISTORY: usize = 64;
 /// Name of the table, and of its column, with the logit of every Gaussian's gain.
 pub const GAINS: &str = "filter_gains";
@@ -59,17 +59,17 @@ pub struct FilteredSpec {
     pub gain: f64,
     /// Seconds between two frames.
     pub frame: f64,
-    /// First second of the clip: nothing earlier is asked for.
+    /// First second of the clip: nothing earlier is requested.
     pub start: f64,
     /// Frames between the two states that the velocity is taken from, 1 (as published) to [`MAX_BASELINE`]: more
     /// predicts more steadily, and later.
     pub baseline: usize,
-    /// Frames before t through which the filter runs, up to [`MAX_HISTORY`]; 0: it predicts from what the model inside
-    /// answers.
+    /// Frames before t through which the filter runs, up to [`MAX_HISTORY`]; 0: it predicts from the results of the
+    /// inner model.
     pub history: usize,
     /// Squared innovation at which the prediction is dropped; 0: never.
     pub gate: f64,
-    /// Whether earlier answers are constants to the gradient.
+    /// Whether earlier results are constants to the gradient.
     pub stop_gradient: bool,
 }
 
@@ -125,7 +125,7 @@ impl Model for FilteredSpec {
         Ok(Arc::new(Filtered::around(inner, self.clone(), p)?))
     }
 
-    /// Those of the model inside: the filter looks back only.
+    /// Those of the inner model: the filter uses only earlier times.
     fn capabilities(&self) -> Capabilities {
         self.inner.capabilities().unwrap_or_default()
     }
@@ -139,7 +139,8 @@ pub struct Filtered<F: Real = f32> {
 }
 
 impl<F: Real> Filtered<F> {
-    /// Wraps a model that is there already, with the layer's gains if it has some. Errors: settings out of range, a loaded table of the wrong shape.
+    /// Wraps a model that is there already, with the layer's gains if it has some. Errors: settings out of range, a
+    /// loaded table of the wrong shape.
     pub fn around(inner: Arc<dyn Motion<F>>, spec: FilteredSpec, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let logit = F::of((spec.gain / (1.0 - spec.gain)).ln());
@@ -173,24 +174,24 @@ impl<F: Real> Filtered<F> {
         if x > 0.0 && x < 1.0 { [x, 1.0 / self.spec.frame] } else { [x.clamp(0.0, 1.0), 0.0] }
     }
 
-    /// Whether the model inside answers the question alone.
+    /// Whether the inner model computes the query alone.
     fn passes(&self, q: &At<'_, F>) -> bool {
         self.spec.fusion == Fusion::Off || q.of != Space::Gaussians || self.trust(q.t.0)[0] == 0.0
     }
 
-    /// The question `frames` earlier.
+    /// The query `frames` earlier.
     fn earlier<'a>(&self, q: &At<'a, F>, frames: usize) -> At<'a, F> {
         At { t: Time(q.t.0 - frames as f64 * self.spec.frame), ..*q }
     }
 
-    /// How many frames earlier a fused question asks in addition to t itself.
+    /// How many frames earlier a fused query reads in addition to t itself.
     fn frames(&self) -> impl Iterator<Item = usize> + use<F> {
         let (baseline, history) = (self.spec.baseline, self.spec.history);
         (1..=history + 1 + baseline).filter(move |&k| k <= history + 1 || k > baseline)
     }
 
-    /// Questions to the model inside in a step; one question a time, for all rows where questions differ in theirs.
-    fn questions<'a>(&self, q: &[At<'a, F>]) -> Vec<At<'a, F>> {
+    /// Queries to the model inside in a step; one query a time, for all rows where queries differ in theirs.
+    fn queries<'a>(&self, q: &[At<'a, F>]) -> Vec<At<'a, F>> {
         let mut all: Vec<At<'a, F>> = Vec::with_capacity(3 * q.len());
         let mut add = |new: At<'a, F>| match all.iter_mut().find(|old| old.of == new.of && old.t == new.t) {
             Some(old) => {
@@ -225,10 +226,10 @@ impl<F: Real> Filtered<F> {
         (prediction, Fused::new(s.fusion, seen, &prediction.point, gain, trust, s.gate))
     }
 
-    /// Fuses all rows of a question at one time into `out`.
+    /// Fuses all rows of a query at one time into `out`.
     fn fuse(&self, q: &At<'_, F>, [seen, last, before]: [&Table<F>; 3], out: &mut Table<F>) {
         let [trust, _] = self.trust(q.t.0);
-        // Opacities, and observations that stand as they are, stay so to the last bit.
+        // Opacities, and unchanged observations, stay so to the last bit.
         out.data_mut().copy_from_slice(seen.data());
         par_split([out.view_mut()], &|[mut view]| {
             for j in view.first..view.first + view.rows {
@@ -249,13 +250,13 @@ struct Shared {
     inner: Cache,
 }
 
-/// State that a fused answer keeps for its backward.
+/// State that a fused result keeps for its backward.
 struct Own<F> {
     /// The observation.
     seen: Tape<F>,
-    /// Earlier answers of the model inside, by frames; unused places are empty.
+    /// Earlier results of the model inside, by frames; unused places are empty.
     earlier: Vec<Tape<F>>,
-    /// States at t and earlier, where the filter runs through its history; place 0 is unused.
+    /// States at t and earlier, where the filter runs through its history; entry 0 is unused.
     states: Vec<Table<F>>,
     /// Gradients to the states, by frames earlier; unused places are empty.
     d: Vec<Table<F>>,
@@ -302,7 +303,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         Some(Arc::new(Self { spec: self.spec.clone(), inner, gains: self.gains }))
     }
 
-    /// The answers of the model inside, now and earlier; a state of each, and the gradients to them.
+    /// The results of the model inside, now and earlier; a state of each, and the gradients to them.
     fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64 {
         let earlier = 1 + self.spec.history.max(self.spec.baseline + 1);
         let numbers = 3 * SPLAT_COLUMNS.iter().map(|c| c.1).sum::<usize>();
@@ -313,7 +314,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         if self.spec.fusion == Fusion::Off {
             return self.inner.prepare(p, q, cache);
         }
-        self.inner.prepare(p, &self.questions(q), &mut cache.get_or_default::<Shared>().inner);
+        self.inner.prepare(p, &self.queries(q), &mut cache.get_or_default::<Shared>().inner);
     }
 
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {
@@ -444,7 +445,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         }
         let cache = &mut cache.get_or_default::<Shared>().inner;
         let d_cache = &mut d_cache.get_or_default::<Shared>().inner;
-        self.inner.finish(p, &self.questions(q), cache, d_cache, d);
+        self.inner.finish(p, &self.queries(q), cache, d_cache, d);
     }
 
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {

@@ -5,9 +5,9 @@
 //! SH_t = SH + δSH; any may be missing. s is half the longest side of the box, so that learning rates need no unit.
 //! trunk = Linear then D − 1 times (ReLU, Linear), D = `defor_depth`, 0 and 1 alike; head = Linear, ReLU, Linear.
 //!
-//! The canonical positions are not detached: dL/dx has the planes' Jacobian too. The box [low, high] is stretched to the
-//! planes' [0, 1]³, the clip to [0, 1]; points and times outside see the border. Heads start as zero, so the deformation
-//! starts as the identity, whatever the planes are. In a [`Phase`] that rests, it is not even asked.
+//! The canonical positions are not detached: dL/dx has the planes' Jacobian too. The box [low, high] is stretched to
+//! the planes' [0, 1]³, the clip to [0, 1]; points and times outside see the border. Heads start as zero, so the
+//! deformation starts as the identity, whatever the planes are. In a resting [`Phase`] it is not evaluated.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{Still, activate_backward_lanes, activate_lanes};
@@ -229,7 +229,7 @@ impl Hexplane {
         F::of(if last > first { ((t - first) / (last - first)).clamp(-1.0, 2.0) } else { 0.0 })
     }
 
-    /// Features and trunk of rows `from..` of a question into `w`.
+    /// Features and trunk of rows `from..` of a query into `w`.
     fn trunk<F: Real>(&self, p: &Params<F>, lines: &Lines<F>, x: &[[F; 3]], w: &mut Activations<F>) {
         w.features.resize(x.len() * self.spec.planes.features(), F::ZERO);
         w.hidden.resize(x.len() * self.spec.net_width, F::ZERO);
@@ -373,7 +373,7 @@ impl<F: Real> Motion<F> for Hexplane {
         }
         let n = q.len();
         let own: &mut Own<F> = tape.own.get_or_default();
-        assert_eq!(own.x.len(), n, "a backward follows the forward of the same question");
+        assert_eq!(own.x.len(), n, "a backward follows the forward of the same query");
         let lines = self.planes.lines(q.p, self.share(q.t.0));
         let mut d_rows = Table::new(&[("d_rows", 11)], n);
         fill(&Activated { moved: &own.moved, d_out: d_out.out }, [&mut d_rows], Rows::All);
@@ -443,7 +443,7 @@ impl<F: Real> Motion<F> for Hexplane {
 }
 
 impl Hexplane {
-    /// Positions of the asked rows in the box's [0, 1]³.
+    /// Positions of the requested rows in the box's [0, 1]³.
     fn locate<F: Real>(&self, q: &At<'_, F>, x: &mut Vec<[F; 3]>) {
         let (low, high) = (self.spec.low, self.spec.high);
         let origin: [F; 3] = std::array::from_fn(|k| F::of(low[k]));

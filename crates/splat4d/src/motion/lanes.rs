@@ -1,8 +1,8 @@
 //! Sixteen rows at a time: how models whose rows do not see one another become loops over lanes, which vectorise.
 //!
-//! A [`Work`] sees a [`Batch`] of rows, reads its columns as [`Lane`]s, and writes lanes back. [`fill`] walks the rows of an
-//! answer (compact), [`scatter`] the rows of the layer's own tables. Both run at the best SIMD level of the machine; since
-//! nothing here uses fused multiply-add, every level gives the same bits.
+//! A [`Work`] gets a [`Batch`] of rows, reads its columns as [`Lane`]s, and writes lanes back. [`fill`] walks the rows
+//! of a result (compact), [`scatter`] the rows of the layer's own tables. Both run at the best SIMD level of the
+//! machine; since nothing here uses fused multiply-add, every level gives the same bits.
 
 use crate::math::Real;
 use crate::scene::table::{TableMut, par_split};
@@ -36,7 +36,7 @@ impl Span {
     }
 
     fn of(rows: [u32; BLOCK]) -> Self {
-        // Increasing numbers that end 15 above their start leave none out, unless the last one stands there repeatedly.
+        // Increasing numbers that end 15 above their start leave none out, unless the last one is there repeatedly.
         let [first, last] = [rows[0], rows[BLOCK - 1]];
         let dense = last - first == BLOCK as u32 - 1 && rows[BLOCK - 2] < last;
         let lie = match (dense, first as usize % BLOCK) {
@@ -98,7 +98,7 @@ impl Span {
 pub(crate) struct Batch {
     /// Rows of the layer's tables.
     pub ids: Span,
-    /// Rows of the compact answer.
+    /// Rows of the compact result.
     pub at: Span,
     /// Which lanes count; the others hold numbers that mean nothing.
     pub live: [bool; BLOCK],
@@ -117,14 +117,14 @@ impl Batch {
         total(each(|l| if self.live[l] { lane[l].f64() } else { 0.0 }))
     }
 
-    /// Writes neighbouring columns of one block of an answer; only [`fill`] has whole blocks.
+    /// Writes neighbouring columns of one block of a result; only [`fill`] has whole blocks.
     #[inline(always)]
     pub(crate) fn write<F: Real, const W: usize>(&self, view: &mut TableMut<'_, F>, col: usize, values: &[Lane<F>; W]) {
         let from = self.place(view, self.at, col);
         view.data[from..from + W * BLOCK].copy_from_slice(values.as_flattened());
     }
 
-    /// Neighbouring columns of one block of an answer, as they are now.
+    /// Neighbouring columns of one block of a result, with their present values.
     #[inline(always)]
     pub(crate) fn lanes<F: Real, const W: usize>(&self, view: &TableMut<'_, F>, col: usize) -> [Lane<F>; W] {
         let from = self.place(view, self.at, col);
@@ -168,14 +168,14 @@ pub(crate) trait Work<F: Real, const N: usize>: Sync {
     fn run(&self, batch: &Batch, tables: &mut [TableMut<'_, F>; N]) -> f64;
 }
 
-/// Does `work` for every row of an answer, whose tables these are; all 16 rows of a block are written, also those past the
-/// last row, which mean nothing.
+/// Does `work` for every row of a result, whose tables these are; all 16 rows of a block are written, also those past
+/// the last row, which mean nothing.
 pub(crate) fn fill<F: Real, const N: usize>(work: &impl Work<F, N>, tables: [&mut Table<F>; N], rows: Rows<'_>) {
     let simd = Simd::detect();
     par_split(tables.map(Table::view_mut), &|views| dispatch(simd, Fill { work, views, rows }));
 }
 
-/// Does `work` for the asked rows of a layer's tables; returns the sum of what it returns, in a fixed order.
+/// Does `work` for the requested rows of a layer's tables; returns the sum of what it returns, in a fixed order.
 pub(crate) fn scatter<F: Real, const N: usize>(
     work: &impl Work<F, N>,
     tables: [&mut Table<F>; N],
@@ -211,7 +211,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Fill<'_, F, W, N> {
     }
 }
 
-/// Where at least one row in so many of a run of rows takes part, whole blocks are worked on, idle lanes included.
+/// If at least one row in this many of a run of rows takes part, whole blocks are worked on, idle lanes included.
 const DENSE: usize = 4;
 
 struct Scatter<'a, F, W, const N: usize> {
@@ -233,11 +233,11 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
     }
 }
 
-/// All batches of the asked rows among `first..end`, where `first` is that of a block. An iterator, since a closure would be
-/// compiled by itself and for the baseline alone.
+/// All batches of the requested rows among `first..end`, where `first` is that of a block. An iterator, since a closure
+/// would be compiled separately and for the baseline only.
 pub(crate) struct Batches<'a> {
     rows: Rows<'a>,
-    /// The next block, or place in the list of rows; and the end of these.
+    /// The next block, or position in the list of rows; and the end of these.
     next: usize,
     to: usize,
     end: usize,
@@ -245,7 +245,7 @@ pub(crate) struct Batches<'a> {
 }
 
 impl<'a> Batches<'a> {
-    /// Panics: a row that is asked for does not exist, when its batch is read.
+    /// Panics: a row that is requested does not exist, when its batch is read.
     #[inline(always)]
     pub(crate) fn new(rows: Rows<'a>, first: usize, end: usize) -> Self {
         let (next, to) = match rows {

@@ -1,4 +1,4 @@
-//! Motion models: from parameters and a time to splats. A model never sees a pixel; it is a pure function of its
+//! Motion models: from parameters and a time to splats. A model does not depend on pixels; it is a pure function of its
 //! parameters.
 //!
 //! A model has no hidden state. Sequential ones (state space, filters) scan in [`Motion::prepare`], add to the scan's
@@ -38,12 +38,12 @@ pub use registry::{Capabilities, Phase, Polynomial, Slices};
 pub use spacetime::{Spacetime, SpacetimeSpec};
 pub use still::Still;
 
-/// One question to a motion model.
+/// One query to a motion model.
 #[derive(Clone, Copy, Debug)]
 pub struct At<'a, F = f32> {
     /// The layer's parameters.
     pub p: &'a Params<F>,
-    /// Gaussians, or nodes (which then answer as splats: node losses, node warm-up).
+    /// Gaussians, or nodes (evaluated as splats: node losses, node warm-up).
     pub of: Space,
     /// Which rows.
     pub rows: Rows<'a>,
@@ -52,12 +52,12 @@ pub struct At<'a, F = f32> {
 }
 
 impl<F: Real> At<'_, F> {
-    /// How many splats are asked for.
+    /// How many splats are requested.
     pub fn len(&self) -> usize {
         self.rows.len(self.p.rows_of(self.of))
     }
 
-    /// Whether no splat is asked for.
+    /// Whether no splat is requested.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -88,10 +88,10 @@ impl std::fmt::Debug for Slot {
     }
 }
 
-/// Values that a model computes once a step for all questions together; the gradient is another one.
+/// Values that a model computes once per step for all queries together; the gradient is another one.
 pub type Cache = Slot;
 
-/// One answer, and what the model needs to remember of it for its backward.
+/// One result, and what the model needs to remember of it for its backward.
 #[derive(Debug, Default)]
 pub struct Tape<F = f32> {
     /// [splats, 10], see [`SPLAT_COLUMNS`].
@@ -116,7 +116,7 @@ registry! {
     models {
         /// Nothing moves.
         Still = "still" => &Still;
-        /// Explicit kinematics around each Gaussian's life.
+        /// Explicit kinematics around each Gaussian's lifespan.
         Spacetime(s: SpacetimeSpec) = "spacetime" => s;
         /// A perceptron or a hash grid deforms a canonical cloud.
         DeformMlp(s: deform::DeformSpec) = "deform-mlp" => s;
@@ -146,20 +146,20 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
     /// Plain data from which [`build`] makes this model again.
     fn spec(&self) -> Spec;
 
-    /// Once a step, before any `at`, with all its questions: scans, filters, neighbours, node poses.
+    /// Once per step, before any `at`, with all its queries: scans, filters, neighbours, node poses.
     fn prepare(&self, _p: &Params<F>, _q: &[At<'_, F>], _cache: &mut Cache) {}
 
-    /// Fills `tape.out` [rows, 10] for one question; random access in t.
+    /// Fills `tape.out` [rows, 10] for one query; random access in t.
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>);
 
-    /// Where the splats' colour comes from; the layer's SH unless a model states otherwise.
+    /// Source of the splats' colour; the layer's SH unless a model states otherwise.
     fn color<'a>(&self, q: &At<'a, F>, _tape: &'a Tape<F>) -> Color<'a, F> {
         Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true }
     }
 
     /// The VJP of `at` (and of `color`, unless it is the layer's SH): adds to `d` and `d_cache`, returns dL/dt.
     ///
-    /// Must not read the opacity column of `tape.out`: the layer has multiplied it by the life.
+    /// Must not read the opacity column of `tape.out`: the layer has multiplied it by the lifespan.
     fn backward(
         &self,
         q: &At<'_, F>,
@@ -170,7 +170,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         d: &mut Grads<F>,
     ) -> f64;
 
-    /// Once a step, after every `backward`: the VJP of `prepare`.
+    /// Once per step, after every `backward`: the VJP of `prepare`.
     fn finish(&self, _p: &Params<F>, _q: &[At<'_, F>], _cache: &mut Cache, _d_cache: &mut Cache, _d: &mut Grads<F>) {}
 
     /// After a row edit has gathered every table: what copying alone cannot do (re-timed clones, 4D split offsets).
@@ -182,8 +182,8 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         p[GEOMETRY].add(row, LOG_SCALE, [F::of(factor.ln()); 3]);
     }
 
-    /// For models whose life is not the layer's: fills [N, 2] with (centre, log width) of a `GaussHalf` life and returns
-    /// true. False: the layer's own life table states it.
+    /// For models whose lifespan is not the layer's: fills [N, 2] with (centre, log width) of a `GaussHalf` life and
+    /// returns true. False: the layer's own lifespan table states it.
     fn life(&self, _p: &Params<F>, _out: &mut Table<F>) -> bool {
         false
     }
@@ -193,8 +193,8 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         self.spec().capabilities().unwrap_or_default()
     }
 
-    /// Takes a similarity into the model's own tables, as the layer takes it into geometry and colours. False: it cannot,
-    /// and nothing has changed.
+    /// Takes a similarity into the model's own tables, as the layer takes it into geometry and colours. False: it
+    /// cannot, and nothing has changed.
     fn apply_transform(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
         false
     }
@@ -209,21 +209,22 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         None
     }
 
-    /// The table whose first columns are positions and quaternions at t, if all else of the geometry stays as it is.
+    /// The table whose first columns are positions and quaternions at t, if all other geometry is constant.
     fn pose_table(&self, _t: Time) -> Option<Key> {
         None
     }
 
-    /// Bytes that training keeps of one question about `rows` Gaussians until its backward, next to the answer and its
-    /// gradient: what an estimate of memory must know.
+    /// Bytes that training keeps of one query about `rows` Gaussians until its backward, next to the result and its
+    /// gradient: for estimates of memory.
     fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64;
 
-    /// The same model in a phase of training; tables stay as they are. `None`: the model has no phases.
+    /// The same model in a phase of training; tables are not changed. `None`: the model has no phases.
     fn with_phase(&self, _phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
         None
     }
 
-    /// dμ/dt in scene units a second, [rows, 3]: central differences over ± `VELOCITY_STEP` unless a model knows better.
+    /// dμ/dt in scene units per second, [rows, 3]: central differences over ± `VELOCITY_STEP` unless a model has
+    /// better.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         central_velocity(self, q, out);
     }
@@ -245,11 +246,11 @@ pub(crate) fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At
     }
 }
 
-/// Half the step of the default velocity: half a frame at 60 frames a second, seconds.
+/// Half the step of the default velocity: half a frame at 60 frames per second, seconds.
 pub(crate) const VELOCITY_STEP: f64 = 1.0 / 120.0;
 
-/// Calls `f(j, id, tables)` for every asked row, in parallel over runs of table rows, and returns the sum of the results
-/// in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use `lanes`.
+/// Calls `f(j, id, tables)` for every requested row, in parallel over runs of table rows, and returns the sum of the
+/// results in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use `lanes`.
 pub fn for_rows<F: Real, const N: usize>(
     tables: [&mut Table<F>; N],
     rows: Rows<'_>,

@@ -1,4 +1,5 @@
-//! Motion models from outside the library, by name: a program that registers its model can reopen scenes that move by it.
+//! Motion models from outside the library, by name: a program that registers its model can reopen scenes that move by
+//! it.
 
 use super::{BUILT_IN, Motion};
 use crate::math::Real;
@@ -13,8 +14,9 @@ pub type MakeMotion = Arc<dyn Fn(&mut Params<f32>) -> Result<Arc<dyn Motion<f32>
 
 static REGISTERED: RwLock<BTreeMap<String, MakeMotion>> = RwLock::new(BTreeMap::new());
 
-/// Makes the model called `name` known to [`build`](super::build), and so to every reader of scenes, for the rest of the
-/// process. A model of that name that was registered before is replaced. Its [`Spec`](super::Spec) is `Spec::Custom(name)`.
+/// Registers the model called `name` with [`build`](super::build), and so to every reader of scenes, for the rest of
+/// the process. A model of that name that was registered before is replaced. Its [`Spec`](super::Spec) is
+/// `Spec::Custom(name)`.
 ///
 /// Errors: the name is empty, has other characters than letters, digits, `-` and `_`, or is one of the library's.
 pub fn register(name: &str, make: MakeMotion) -> Result<()> {
@@ -36,7 +38,8 @@ pub fn is_registered(name: &str) -> bool {
     REGISTERED.read().unwrap_or_else(PoisonError::into_inner).contains_key(name)
 }
 
-/// The registered model of that name, made; `None`: there is none, or F is not `f32`, the numbers that scenes are made of.
+/// The registered model of that name, made; `None`: there is none, or F is not `f32`, the numbers that scenes are made
+/// of.
 pub(super) fn build<F: Real>(name: &str, p: &mut Params<F>) -> Option<Result<Arc<dyn Motion<F>>>> {
     // Cloned, so that a model may register another while it is made.
     let make = REGISTERED.read().unwrap_or_else(PoisonError::into_inner).get(name).cloned()?;
@@ -56,7 +59,7 @@ mod tests {
     use crate::motion::{At, Cache, Spec, Tape};
     use crate::scene::{GEOMETRY, Grads, Key, LifeKind, Space, SplatGrads, Time};
 
-    /// Falls with a speed of its own a Gaussian, scene units a second.
+    /// Falls with a speed of its own a Gaussian, scene units per second.
     struct Falls(Key);
 
     impl Falls {

@@ -24,14 +24,14 @@ pub(crate) trait Model {
 /// model from outside the library.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Capabilities {
-    /// Something may depend on time, next to the layer's life.
+    /// Something may depend on time, next to the layer's lifespan.
     pub moves: bool,
     /// Gaussians may turn as they move.
     pub rotates: bool,
-    /// Birth and death are the model's own ([`Motion::life`]), and the layer needs no life table.
+    /// Birth and death are the model's own ([`Motion::life`]), and the layer needs no lifespan table.
     pub own_life: bool,
-    /// State runs forward in time: an answer at t depends on no number that stands for a later time, so that what follows
-    /// can be learnt or cut off without a change of what was.
+    /// State runs forward in time: a result at t depends on no number that represents a later time, so that what
+    /// follows can be learnt or cut off without a change of what was.
     pub causal: bool,
     /// Fixed cameras that must see every time for the model to be learnt.
     pub fixed_cameras: usize,
@@ -54,8 +54,8 @@ pub struct Phase {
     pub levels: Option<usize>,
 }
 
-/// Motion as a polynomial in time around the centre of each Gaussian's life: what files of kinematic Gaussians hold, and
-/// what bakes without a fit where it is straight.
+/// Motion as a polynomial in time around the centre of each Gaussian's lifespan: what files of kinematic Gaussians
+/// hold, and what bakes without a fit where it is straight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Polynomial {
     /// Order in Δ, seconds from the centre; 0: positions stay.
@@ -64,9 +64,9 @@ pub struct Polynomial {
     pub velocities: Option<Key>,
     /// Table of quaternion rates, [N, 4], 1/s; none: rotations stay.
     pub rotation_rates: Option<Key>,
-    /// Centre for Gaussians that live for ever, seconds.
+    /// Centre for Gaussians that have infinite lifespans, seconds.
     pub origin: f64,
-    /// Whether Δ is a constant, so that the life's centre learns from opacity alone.
+    /// Whether Δ is a constant, so that the lifespan's centre learns from opacity alone.
     pub detached: bool,
 }
 
@@ -75,7 +75,7 @@ pub struct Polynomial {
 pub struct Slices {
     /// Table of the columns beyond the geometry.
     pub own: Key,
-    /// κ, scene units a second.
+    /// κ, scene units per second.
     pub speed: f64,
     /// Least c, scene units².
     pub floor: f64,
@@ -88,12 +88,12 @@ pub struct Slices {
 }
 
 impl Polynomial {
-    /// Whether everything goes along straight lines and nothing turns.
+    /// Whether all motion is linear without rotation.
     pub(crate) fn is_straight(&self) -> bool {
         self.order <= 1 && self.rotation_rates.is_none()
     }
 
-    /// How far a row's mean goes from the centre of its life to `delta` seconds later, scene units.
+    /// Displacement of a row's mean from the centre of its lifespan to `delta` seconds later, scene units.
     pub fn travel<F: Real>(&self, p: &Params<F>, row: usize, delta: f64) -> [f64; 3] {
         let mut out = [0.0; 3];
         let Some(key) = self.velocities else { return out };
@@ -104,11 +104,11 @@ impl Polynomial {
         out
     }
 
-    /// Moves the centre of a row's life by `shift` seconds and leaves its path and its turning as they are, of every order:
-    /// what it showed at any time it shows still, but for its life. Colours that change with time begin again at the
-    /// centre.
+    /// Moves the centre of a row's lifespan by `shift` seconds and keeps its path and rotation, for models of every
+    /// order: what it showed at any time it shows still, but for its lifespan. Colours that change with time begin
+    /// again at the centre.
     ///
-    /// Panics: the layer's Gaussians live for ever.
+    /// Panics: the layer's Gaussians have infinite lifespans.
     pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {
         assert!(p[LIFE].width() > 0, "a Gaussian without lifespan has no temporal centre to move");
         let travel = self.travel(p, row, shift);
@@ -133,7 +133,7 @@ impl Polynomial {
     }
 }
 
-/// Makes of the list of models `Spec`, the names, and all that is asked of a model by its spec.
+/// Generates `Spec`, the names and all functions of specs from the list of models.
 ///
 /// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
 /// the payload's type, the model's name, and a reference to what implements `Model`.
@@ -205,8 +205,8 @@ macro_rules! registry {
             build_as(spec, p)
         }
 
-        /// As [`build`], over any kind of numbers: gradients are checked in f64. It is apart so that the models over f32
-        /// are compiled once, here, and not again in every crate that makes one.
+        /// As [`build`], over any kind of numbers: gradients are checked in f64. It is apart so that the models over
+        /// f32 are compiled once, here, and not again in every crate that makes one.
         pub fn build_as<F: Real>(spec: &Spec, p: &mut Params<F>) -> Result<Arc<dyn Motion<F>>> {
             match spec {
                 $(Spec::$variant $(($bound))? => Model::build($model, p),)*

@@ -1,18 +1,18 @@
 //! Skinning: Gaussians follow sparse control nodes, whatever drives the nodes (Huang et al. 2024, "SC-GS").
 //!
 //! Node k has a rest position p_k, a log radius, a weight logit w_k and hyper coordinates h_k; Gaussian i its canonical
-//! position x_i and hyper coordinates h_i. A [`Trajectory`] gives every node a shift T_k(t) and a rotation R_k(t) about its
-//! own position. With weights a_ik (see `weights`) a Gaussian goes to
+//! position x_i and hyper coordinates h_i. A [`Trajectory`] gives every node a shift T_k(t) and a rotation R_k(t) about
+//! its own position. With weights a_ik (see `weights`) a Gaussian moves to
 //!
 //! > x_i(t) = Σ_k a_ik [R_k (x_i − p_k) + p_k + T_k] (linear blend skinning),
 //! > q_i(t) = normalize(Σ_k a_ik s_k u_k) ⊗ q_i,
 //!
-//! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion mask
-//! m_i = sigmoid(`motion_mask`) a Gaussian goes the share m_i of the way: x_i + m_i (x_i(t) − x_i), and likewise for the
+//! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion
+//! mask m_i = sigmoid(`motion_mask`) a Gaussian moves by the share m_i: x_i + m_i (x_i(t) − x_i), and likewise for the
 //! quaternion, from the identity.
 //!
-//! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for every
-//! table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones, refreshed by
+//! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for
+//! every table. The choice of nodes is not learnt: every Gaussian has a list of the nearest ones, refreshed by
 //! `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
@@ -41,11 +41,11 @@ pub const MAX_NODES: usize = 1 << 16;
 pub const MAX_NEIGHBOURS: usize = 8;
 /// Most hyper coordinates.
 pub(crate) const MAX_HYPER: usize = 32;
-/// Nodes on a Gaussian's list beyond those that pull it: room for weights to shift between two refreshes.
+/// Nodes on a Gaussian's list beyond those that pull it, so that weights can shift between two refreshes.
 const SPARE_CANDIDATES: usize = 5;
 /// Spread of the nodes' hyper coordinates at the start, in node spacings: enough to break the tie (SC-GS: 1e-2).
 const HYPER_NOISE: f64 = 1e-2;
-/// The motion mask's logit at the start: Gaussians follow their nodes nearly all the way.
+/// The motion mask's logit at the start: Gaussians follow their nodes almost completely.
 const MASK_LOGIT: f64 = 3.0;
 /// Numbers of a frame: a 3 × 4 matrix.
 const FRAME: usize = 12;
@@ -65,7 +65,7 @@ pub(crate) const POSE_COLUMNS: [(&str, usize); 2] = [("shift", 3), ("turn", 4)];
 
 /// The trajectories of control nodes.
 pub trait Trajectory<F: Real>: Send + Sync {
-    /// Once a step with all its times: scans, networks.
+    /// Once per step with all its times: scans, networks.
     fn prepare(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot) {}
 
     /// Node poses at t, one of the prepared times: fills `out` [nodes, 7] with the displacement 3 (scene units) and the
@@ -83,7 +83,7 @@ pub trait Trajectory<F: Real>: Send + Sync {
         d: &mut Grads<F>,
     ) -> f64;
 
-    /// Once a step: the VJP of `prepare`.
+    /// Once per step: the VJP of `prepare`.
     fn finish(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot, _d_cache: &mut Slot, _d: &mut Grads<F>) {}
 
     /// Bytes that a step keeps of `prepare` for [`finish`](Self::finish).
@@ -124,10 +124,8 @@ impl SkinSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return Err(Error::input(format!(
-                    "a skin with {name} = {value} cannot be: {low} to {high} is possible"
-                ))
-                .remedy("The file is damaged or was written by another program; export it again"));
+                return Err(Error::input(format!("invalid skin: {name} = {value}, expected {low} to {high}"))
+                    .remedy("The file is damaged or was written by another program; export it again"));
             }
         }
         Ok(())
@@ -150,9 +148,10 @@ pub struct Skin {
 }
 
 impl Skin {
-    /// Makes or claims the tables in `p`: nodes at farthest points of the Gaussians, as wide as they are apart, all bound.
+    /// Makes or claims the tables in `p`: nodes at farthest points of the Gaussians, as wide as they are apart, all
+    /// bound.
     ///
-    /// Where the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of the
+    /// If the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of the
     /// spec out of range, loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(spec: SkinSpec, seed: u64, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
@@ -235,8 +234,8 @@ fn start_nodes<F: Real>(t: &mut Table<F>, centers: &[[F; 3]], rng: Rng) {
     }
 }
 
-/// Motion made of a skin and of what drives its nodes. Questions of [`Space::Nodes`] are answered by isotropic splats:
-/// the node's position, its radius, sigmoid(logit) as opacity.
+/// Motion by a skin and a model that drives its nodes. Queries of [`Space::Nodes`] return isotropic splats: the node's
+/// position, its radius, sigmoid(logit) as opacity.
 pub struct Skinned<F: Real> {
     /// Which Gaussian follows which nodes.
     pub skin: Skin,
@@ -282,7 +281,7 @@ impl<F: Real> Skinned<F> {
     /// The same motion with nodes displaced at all times, for editing: `offsets` [nodes, 7] are shifts to be added and
     /// rotations to be done after the nodes' own, as [`arap`](super::arap) gives them. Files cannot hold it.
     ///
-    /// Panics: not as many offsets as nodes, when it is asked.
+    /// Panics: not as many offsets as nodes, when it is queried.
     pub fn with_offsets(&self, offsets: Table<F>) -> Self {
         let trajectory = Arc::new(offset::Offset { of: self.trajectory.clone(), by: offsets });
         Self { skin: self.skin, trajectory, spec: Spec::Custom(format!("{} with displaced nodes", self.spec.name())) }
@@ -308,7 +307,7 @@ impl<F: Real> Skinned<F> {
     }
 
     fn prepared<'a>(&self, cache: &'a Cache, t: Time) -> (&'a Prepared<F>, &'a Frames<F>) {
-        let c: &Prepared<F> = cache.get().expect("prepare comes before every question");
+        let c: &Prepared<F> = cache.get().expect("`prepare` precedes every query");
         let i = c.times.iter().position(|x| same(*x, t)).expect("every time of a step was prepared");
         (c, &c.frames[i])
     }
@@ -357,7 +356,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
             fill_rows(&mut tape.out, q.rows, |id| frames.splat(&q.p[self.skin.nodes], id));
             return;
         }
-        let ask = blend::Ask { skin: &self.skin, p: q.p, weights: &c.weights, frames };
+        let ask = blend::SkinQuery { skin: &self.skin, p: q.p, weights: &c.weights, frames };
         fill(&ask, [&mut tape.out], q.rows);
     }
 
@@ -387,7 +386,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
         } else {
             let width = c.weights.neighbours() * q.p.len();
             pending.weights.resize(width, F::ZERO);
-            let ask = blend::Ask { skin: &self.skin, p: q.p, weights: &c.weights, frames };
+            let ask = blend::SkinQuery { skin: &self.skin, p: q.p, weights: &c.weights, frames };
             let d_frames = ask.backward(q.rows, d_out.out, &mut pending.weights, d);
             let [d_nodes] = d.of([self.skin.nodes]);
             frames.backward(&d_frames, &mut d_poses, d_nodes);

@@ -1,10 +1,10 @@
-//! `spacetime`: the unified kinematic primitive. Around the centre c of its life (Δ = t − c, seconds) a Gaussian has
-//! μ(t) = μ + v₁Δ + v₂Δ² + v₃Δ³ and q(t) = normalize(q + ωΔ).
+//! `spacetime`: the unified kinematic primitive. Around the centre c of its lifespan (Δ = t − c, seconds) a Gaussian
+//! has μ(t) = μ + v₁Δ + v₂Δ² + v₃Δ³ and q(t) = normalize(q + ωΔ).
 //!
 //! It covers static 3DGS (order 0), FreeTimeGS (order 1, life `GaussHalf`), STG-lite (order 3, rotation rate, life
-//! `GaussOne`, detached) and native 4D Gaussians in the Cholesky chart. With [`FeatureSpec`] it is the full STG: a Gaussian
-//! has a base colour b (its SH coefficient of degree 0), view features f and time features g, and shows the nine channels
-//! [b, f, g·Δ], which the scene's head turns into colour pixel by pixel (`render/head.rs`).
+//! `GaussOne`, detached) and native 4D Gaussians in the Cholesky chart. With [`FeatureSpec`] it is the full STG: a
+//! Gaussian has a base colour b (its SH coefficient of degree 0), view features f and time features g, and shows the
+//! nine channels [b, f, g·Δ], which the scene's head turns into colour pixel by pixel (`render/head.rs`).
 //! Source: Li et al. 2024 (STG) §3; Wang et al. 2025 (FreeTimeGS) §3.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
@@ -29,12 +29,12 @@ pub struct SpacetimeSpec {
     pub order: usize,
     /// Whether quaternions have a rate.
     pub rotation: bool,
-    /// Whether Δ is a constant in position and rotation, so that the life's centre learns from opacity alone (STG).
+    /// Whether Δ is a constant in position and rotation, so that the lifespan's centre learns from opacity alone (STG).
     pub detach: bool,
-    /// Origin of Δ for Gaussians that live for ever: the clip's centre, seconds.
+    /// Origin of Δ for Gaussians that have infinite lifespans: the clip's centre, seconds.
     pub origin: f64,
-    /// Features for a head (STG's full model), of which spherical harmonics above degree 0 are no part; none: colours as
-    /// they are.
+    /// Features for a head (STG's full model), of which spherical harmonics above degree 0 are no part; none: colours
+    /// unchanged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub features: Option<FeatureSpec>,
 }
@@ -126,7 +126,7 @@ impl Spacetime {
     }
 
     /// The same motion on a clock that runs `rate` times as fast: inside it is rate·t + offset. Changes the model's own
-    /// tables; lives are the layer's.
+    /// tables; lifespans are the layer's.
     pub(crate) fn retimed<F: Real>(&self, rate: f64, offset: f64, p: &mut Params<F>) -> Self {
         let (velocities, rates) = (&mut p[self.velocities], F::of(rate));
         for row in 0..velocities.rows() {
@@ -248,7 +248,7 @@ impl<F: Real> Motion<F> for Spacetime {
     }
 }
 
-/// One question's parameters, read sixteen rows at a time.
+/// One query's parameters, read sixteen rows at a time.
 struct Reader<'a, F> {
     spec: SpacetimeSpec,
     geometry: &'a Table<F>,
@@ -280,7 +280,7 @@ impl<'a, F: Real> Reader<'a, F> {
         each(|l| F::of(self.t) - center[l])
     }
 
-    /// The learnable rows at Δ: means moved, quaternions turned, all else as it is.
+    /// The learnable rows at Δ: means moved, quaternions turned, all else unchanged.
     #[inline(always)]
     fn moved(&self, batch: &Batch, delta: &Lane<F>) -> [Lane<F>; 11] {
         let mut g: [Lane<F>; 11] = batch.ids.read(self.geometry, 0);

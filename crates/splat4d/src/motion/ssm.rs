@@ -1,18 +1,20 @@
 //! `ssm`: control nodes driven by a diagonal state-space model (our design on S4D, Gu et al. 2022).
 //!
-//! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding, and
-//! what its surroundings look like. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan serving every
-//! time of a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between ticks both
-//! are interpolated (Catmull-Rom); the node goes to p + ρ and turns by exp(θ) about itself. Gaussians follow by skinning
+//! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding,
+//! and its surroundings. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan serving every time of
+//! a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between ticks both are
+//! interpolated (Catmull-Rom); the node moves to p + ρ and turns by exp(θ) about itself. Gaussians follow by skinning
 //! (`motion::skin`).
 //!
-//! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as asked for.
+//! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as
+//!   requested.
 //! - `output`: poses, or their rates, which are composed from tick to tick (drifts, but carries on).
-//! - `equivariance`: none; `frames`: all that the network sees and states is in local frames of the nodes (`nn::frames`),
-//!   so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror exactly, too.
+//! - `equivariance`: none; `frames`: inputs and outputs of the network are in local frames of the nodes
+//!   (`nn::frames`), so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror
+//!   exactly, too.
 //!
-//! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
-//! fixed: no gradient goes through it to the nodes' positions.
+//! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held fixed: no
+//! gradient is propagated through it to the nodes' positions.
 
 mod context;
 mod net;
@@ -58,7 +60,7 @@ pub enum Output {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Equivariance {
-    /// None: nodes know where they are.
+    /// None: positions are inputs.
     None,
     /// Translations and rotations, by local frames.
     Frames,
@@ -139,9 +141,7 @@ impl SsmSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return broken(format!(
-                    "a state-space model of {name} = {value} cannot be: {low} to {high} is possible"
-                ));
+                return broken(format!("invalid state-space model: {name} = {value}, expected {low} to {high}"));
             }
         }
         let span = self.clip[1] - self.clip[0];
@@ -165,9 +165,9 @@ pub(crate) struct Field {
 
 /// Name of the table of embeddings, \[nodes, D\].
 pub(crate) const EMBEDDINGS: &str = "node_embeddings";
-/// Name of the table of what nodes know of their surroundings.
+/// Name of the table of the nodes' context.
 pub(crate) const CONTEXT: &str = "node_context";
-/// Numbers a node has at a tick of a scan: its pose and the gradient to it, as they are and on their way.
+/// Numbers a node has at a tick of a scan: its pose and the gradient to it, raw and intermediate.
 const TICK: usize = 32;
 /// Spread of the embeddings at the start.
 const EMBEDDING_NOISE: f64 = 0.1;
@@ -220,14 +220,14 @@ impl Field {
         Ok(Self { spec: spec.clone(), net, embeddings, context })
     }
 
-    /// Where t stands among the ticks.
+    /// Position of t among the ticks.
     fn knots<F: Real>(&self, t: Time) -> Knots<F> {
         let [first, last] = self.spec.clip;
         let per_second = (self.spec.ticks - 1) as f64 / (last - first);
         Knots::new((t.0 - first) * per_second, per_second, self.last_tick())
     }
 
-    /// The last tick there is: the clip's, or as many again to forecast; later times see it for ever.
+    /// The last tick there is: the clip's, or as many again to forecast; later times use it.
     fn last_tick(&self) -> usize {
         match self.spec.mode {
             Mode::Bidirectional => self.spec.ticks - 1,
@@ -243,7 +243,7 @@ impl Field {
         }
     }
 
-    /// Numbers a tick and node.
+    /// Numbers per tick and node.
     fn tick_width(&self) -> usize {
         if self.spec.output == Output::Twist { 7 } else { 6 }
     }
@@ -256,7 +256,7 @@ impl Field {
         // Sixteen nodes a task, each with working memory of its own.
         let tasks = out.par_chunks_mut(LANES * ticks * width).enumerate();
         tasks.for_each_init(NetTape::default, |tape, (block, out)| {
-            let said = self.say(p, &prepared, block, tape);
+            let said = self.node_poses(p, &prepared, block, tape);
             for (lane, out) in out.chunks_exact_mut(ticks * width).enumerate() {
                 for (t, out) in out.chunks_exact_mut(width).enumerate() {
                     (0..width).for_each(|k| out[k] = said[k * ticks + t][lane]);
@@ -267,7 +267,13 @@ impl Field {
     }
 
     /// Poses of sixteen nodes at all ticks in the world's coordinates, \[6 or 7, ticks\].
-    fn say<F: Real>(&self, p: &Params<F>, net: &Prepared<F>, block: usize, tape: &mut NetTape<F>) -> Vec<Lane<F>> {
+    fn node_poses<F: Real>(
+        &self,
+        p: &Params<F>,
+        net: &Prepared<F>,
+        block: usize,
+        tape: &mut NetTape<F>,
+    ) -> Vec<Lane<F>> {
         let around = context::of_block(self.spec.equivariance, &p[self.context], block);
         let mut local = self.net.forward(net, &embedding_lanes(&p[self.embeddings], block), &around, tape);
         context::to_world(self.spec.equivariance, &around, self.spec.extent, &mut local);
@@ -312,7 +318,7 @@ impl<F: Real> Trajectory<F> for Field {
     }
 
     fn poses(&self, _p: &Params<F>, t: Time, cache: &Slot, out: &mut Table<F>) {
-        let scan: &Scan<F> = cache.get().expect("prepare comes before every question");
+        let scan: &Scan<F> = cache.get().expect("`prepare` precedes every query");
         let (knots, width) = (self.knots(t), self.tick_width());
         for node in 0..out.rows() {
             let own = &scan.out[node * scan.ticks * width..(node + 1) * scan.ticks * width];
@@ -329,7 +335,7 @@ impl<F: Real> Trajectory<F> for Field {
         d_cache: &mut Slot,
         _d: &mut Grads<F>,
     ) -> f64 {
-        let scan: &Scan<F> = cache.get().expect("prepare comes before every question");
+        let scan: &Scan<F> = cache.get().expect("`prepare` precedes every query");
         let d_scan = &mut d_cache.get_or_default::<Pending<F>>().0;
         d_scan.resize(scan.out.len(), F::ZERO);
         let (knots, width) = (self.knots(t), self.tick_width());
@@ -373,14 +379,14 @@ impl<F: Real> Trajectory<F> for Field {
         for (block, (grads, d_own)) in found.iter().enumerate() {
             sum.add(grads);
             for row in block * LANES..rows.min((block + 1) * LANES) {
-                // The embedding comes first of what a node sees; no gradient goes to the rest.
+                // The embedding is first among a node's inputs; the rest has no gradient.
                 (0..d_embeddings.width()).for_each(|k| *d_embeddings.get_mut(row, k) += d_own[k][row % LANES]);
             }
         }
         self.net.finish(net, sum, d);
     }
 
-    /// Nodes that came or went change what their neighbours see.
+    /// Added or removed nodes change the context of their neighbours.
     fn on_edit(&self, p: &mut Params<F>, _: &RowEdit) {
         refresh(self.spec.equivariance, p);
     }

@@ -1,5 +1,5 @@
 //! `still`: static 3D Gaussian Splatting (Kerbl et al. 2023). The activation of means, quaternions, scales and opacity
-//! stands here, for every model that ends in an ordinary Gaussian.
+//! is here, for every model that ends in an ordinary Gaussian.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape};

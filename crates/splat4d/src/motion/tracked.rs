@@ -1,10 +1,10 @@
 //! `tracked`: positions and rotations of the same Gaussians at every frame; all else is shared by all frames.
 //!
-//! Frame 0 is the layer's geometry itself; frame k has a page of 7 numbers a Gaussian (28 bytes), `means@k` and `quats@k`.
-//! Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u q̂_{k+1} with the
-//! sign that makes the two quaternions neighbours. Before the first frame and after the last one nothing moves. On a
-//! frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
-//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; what is between frames is ours.
+//! Frame 0 is the layer's geometry itself; frame k has a page of 7 numbers per Gaussian (28 bytes), `means@k` and
+//! `quats@k`. Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u
+//! q̂_{k+1} with the sign that makes the two quaternions neighbours. Before the first frame and after the last one
+//! nothing moves. On a frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
+//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; interpolation between frames is ours.
 
 #[cfg(test)]
 mod tests;
@@ -21,7 +21,7 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Numbers of a pose: position 3, raw quaternion 4. The first so many columns of the geometry are frame 0's.
+/// Numbers of a pose: position 3, raw quaternion 4. The first this many columns of the geometry are frame 0's.
 pub const POSE: usize = 7;
 /// Columns of a page.
 const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];
@@ -33,17 +33,18 @@ pub const FOREGROUND: &str = "foreground_logits";
 pub const LEAST_CAMERAS: usize = 3;
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
-/// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification asks for more has lost
-/// its arrays.
+/// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification requests more has
+/// lost its arrays.
 const MAX_MADE: usize = 1 << 28;
 
 /// The model as plain data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrackedSpec {
-    /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have pages.
+    /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have
+    /// pages.
     pub times: Vec<f64>,
-    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No image depends on it.
+    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks show about them. No image depends on it.
     pub foreground: bool,
 }
 
@@ -71,8 +72,8 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// Pages that are not loaded start where frame 0 stands. Errors: times that do not increase; pages that are missing
-    /// or have another shape.
+    /// Pages that are not loaded start as frame 0. Errors: times that do not increase; pages that are missing or have
+    /// another shape.
     pub fn new<F: Real>(spec: &TrackedSpec, p: &mut Params<F>) -> Result<Self> {
         let times = &spec.times;
         let increase = times.windows(2).all(|w| w[0] < w[1]) && times.iter().all(|t| t.is_finite());
@@ -134,12 +135,12 @@ impl Tracked {
         Ok(())
     }
 
-    /// The model with one frame more at second t, where every Gaussian goes on as it went: x + (x − x') and
-    /// normalize(q̂ ± (q̂ − q̂')), scaled by the durations, no further than `cap` scene units. The first step after frame
-    /// 0 knows no velocity and stays.
+    /// The model with one frame more at second t, where every Gaussian continues as it went: x + (x − x') and
+    /// normalize(q̂ ± (q̂ − q̂')), scaled by the durations, no further than `cap` scene units. The first step after
+    /// after frame 0 there is no velocity and the state stays.
     ///
     /// Source: Luiten et al. 2024 §3.3 (forward propagation); aligned signs, durations and the cap are ours: the
-    /// overshoot of what bounces is bounded by it. Panics: t is not after the last frame.
+    /// overshoot at a bounce is bounded by it. Panics: t is not after the last frame.
     pub fn propagate<F: Real>(&self, p: &mut Params<F>, t: f64, cap: f64) -> Result<Self> {
         let n = self.pages.len();
         let last = self.spec.times[n - 1];
@@ -155,7 +156,7 @@ impl Tracked {
         Ok(next)
     }
 
-    /// The frames around t and the share of the later one; one frame twice where only one counts.
+    /// The frames around t and the share of the later one; the same frame twice where only one counts.
     fn around(&self, t: f64) -> (usize, usize, f64) {
         let times = &self.spec.times;
         let after = times.partition_point(|&x| x <= t);
@@ -206,7 +207,7 @@ impl<F: Real> Motion<F> for Tracked {
         Spec::Tracked(self.spec.clone())
     }
 
-    /// On a frame, and outside of the clip; what is between two frames is of both.
+    /// On a frame, and outside of the clip; between two frames both count.
     fn pose_table(&self, t: Time) -> Option<Key> {
         let (a, b, _) = self.around(t.0);
         (a == b).then_some(self.pages[a])
@@ -263,7 +264,7 @@ impl<F: Real> Motion<F> for Tracked {
     }
 }
 
-/// One question's parameters, read sixteen rows at a time.
+/// One query's parameters, read sixteen rows at a time.
 struct Reader<'a, F> {
     geometry: &'a Table<F>,
     from: &'a Table<F>,

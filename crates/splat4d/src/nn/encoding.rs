@@ -1,8 +1,8 @@
 //! Positional encoding γ_L(p) = [p, sin(2^k p), cos(2^k p)]_{k<L}, without a factor π.
 //!
 //! Source: Mildenhall et al. 2020 (NeRF) §5.1; with the raw input and without π as Yang et al. 2024 (Deformable 3D
-//! Gaussians). Sines of doubled angles come from the angle before, which loses a bit a level: 3e-5 in f32 at level 10,
-//! as much as f32 knows of 2^9·p anyway.
+//! Gaussians). Sines of doubled angles are computed from the previous angle, which loses a bit per level: 3e-5 in f32
+//! at level 10, the precision of 2^9·p in f32.
 
 use crate::math::Real;
 
@@ -37,7 +37,7 @@ pub(crate) fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
 #[inline]
 pub(crate) fn encode_backward<F: Real>(x: &[F], levels: usize, d_out: &[F], d_x: &mut [F]) {
     let d = x.len();
-    assert_eq!((d_x.len(), d_out.len()), (d, encoded(d, levels)), "a gradient has the shape of what it is of");
+    assert_eq!((d_x.len(), d_out.len()), (d, encoded(d, levels)), "a gradient has the shape of its value");
     d_x.copy_from_slice(&d_out[..d]);
     for (i, x) in x.iter().enumerate() {
         let (mut s, mut c, mut factor) = (x.sin(), x.cos(), F::ONE);

@@ -1,9 +1,9 @@
 //! Local frames of points that turn with the points: principal axes of each point's neighbourhood, with signs by the
-//! third moment. What is expressed in such frames does not change when the scene turns.
+//! third moment. Quantities in such frames do not change when the scene rotates.
 //!
-//! Axes are ill-defined where two moments nearly agree, and signs where the neighbourhood is symmetric. There a point takes
-//! what it lacks from its parent in a spanning forest of the neighbour graph (in flat space parallel transport leaves
-//! axes as they are), and a root from the principal axes of all points. Frames are right-handed, so that mirrored
+//! Axes are ill-defined where two moments nearly agree, and signs where the neighbourhood is symmetric. There a point
+//! takes what it lacks from its parent in a spanning forest of the neighbour graph (in flat space parallel transport
+//! leaves axes unchanged), and a root from the principal axes of all points. Frames are right-handed, so that mirrored
 //! scenes are not mirrored by them. They are piecewise smooth in the points at best, hence computed when the set of
 //! points changes and held fixed otherwise.
 
@@ -39,7 +39,7 @@ pub(crate) fn local_frames(points: &[[f64; 3]]) -> Vec<Frame> {
     let whole = Axes::new(&all, &vec![1.0; all.len()]).complete(&WORLD);
     let mut frames = vec![WORLD; points.len()];
     let mut done = vec![false; points.len()];
-    // Roots in the order of how well they know their axes; the index decides ties.
+    // Roots in the order of how well-defined their axes are; the index decides ties.
     let mut roots: Vec<usize> = (0..points.len()).collect();
     roots.sort_by(|&a, &b| own[b].certainty().total_cmp(&own[a].certainty()).then(a.cmp(&b)));
     let around = symmetric(&near, points.len());
@@ -149,7 +149,7 @@ impl Axes {
         self.gaps[0].min(self.gaps[1]).min(self.skews[0].abs()).min(self.skews[1].abs())
     }
 
-    /// The frame, with what the neighbourhood does not know taken from `parent`.
+    /// The frame, with axes that the neighbourhood leaves undefined taken from `parent`.
     fn complete(&self, parent: &Frame) -> Frame {
         let column = |f: &Frame, axis: usize| [0, 1, 2].map(|k| f[k][axis]);
         let sure = self.gaps.map(|g| g >= LEAST_GAP);
@@ -251,7 +251,7 @@ mod tests {
                 assert!(pose.orthogonality_error() < 1e-9, "{f:?}");
             }
         }
-        // A lattice: every inner point sees the same in all directions. Its frame comes from its neighbours.
+        // A lattice: every inner point has a symmetric neighbourhood. Its frame is that of its neighbours.
         let lattice: Vec<[f64; 3]> =
             (0..125).map(|i| [f64::from(i % 5), f64::from(i / 5 % 5), f64::from(i / 25)]).collect();
         assert!(local_frames(&lattice).iter().flatten().flatten().all(|x| x.is_finite()));

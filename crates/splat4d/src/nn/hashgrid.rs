@@ -1,10 +1,10 @@
-//! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share their
-//! entries by a hash.
+//! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share
+//! their entries by a hash.
 //!
-//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at
-//! u·(R_l − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has an
-//! entry for each, any other looks its corners up at (⊕ c_k π_k) mod 2^log2_size.
-//! A level's gradient is scattered by one task in the order of the rows: the bits do not depend on the number of threads.
+//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at u·(R_l
+//! − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has an
+//! entry for each, any other finds its corners at (⊕ c_k π_k) mod 2^log2_size. A level's gradient is scattered by one
+//! task in the order of the rows: the bits do not depend on the number of threads.
 //! Source: Müller et al. 2022 (Instant-NGP) §3 and its conventions in tiny-cuda-nn.
 
 use crate::math::{Real, Rng};
@@ -22,7 +22,7 @@ const INITIAL: f64 = 1e-4;
 pub(crate) const MAX_DIMS: usize = 4;
 /// Most features of an entry.
 const MAX_FEATURES: usize = 8;
-/// Most levels, features an entry, cells a side and, as a power of two, entries a level.
+/// Most levels, features an entry, cells a side and, as a power of two, entries per level.
 const LIMITS: [usize; 4] = [24, MAX_FEATURES, 1 << 16, 22];
 /// Most numbers of a grid: 64 MB in f32.
 const MAX_NUMBERS: usize = 1 << 24;
@@ -51,14 +51,14 @@ impl HashShape {
         self.levels * self.features
     }
 
-    /// Cells a side and entries of every level of a grid with so many axes. Errors: sizes that are not possible.
+    /// Cells a side and entries of every level of a grid with this many axes. Errors: sizes that are not possible.
     fn sizes(&self, dims: usize) -> Result<Vec<(usize, usize)>> {
         let given = [self.levels, self.features, self.finest, self.log2_size];
         let sound = given.iter().zip(LIMITS).all(|(&n, most)| (1..=most).contains(&n))
             && (2..=self.finest).contains(&self.base)
             && (1..=MAX_DIMS).contains(&dims);
         let bad = || {
-            Error::input(format!("a hash grid cannot be {self:?}"))
+            Error::input(format!("invalid hash grid: {self:?}"))
                 .remedy("The file is damaged or was written by another program; export it again")
         };
         if !sound {
@@ -97,8 +97,8 @@ pub struct HashGrid {
 }
 
 impl HashGrid {
-    /// Makes or claims the tables `{name}.{level}` ([entries, features] in one column, `Space::Fixed`) of a grid over the
-    /// numbers `axes` of points of `stride` numbers.
+    /// Makes or claims the tables `{name}.{level}` ([entries, features] in one column, `Space::Fixed`) of a grid over
+    /// the numbers `axes` of points of `stride` numbers.
     ///
     /// Errors: sizes that are not possible; loaded arrays of the wrong shape. Panics: an axis beyond the point.
     pub fn new<F: Real>(
@@ -148,7 +148,8 @@ impl HashGrid {
         }
     }
 
-    /// The VJP of [`forward`](Self::forward): adds to the entries' gradients in `d`, and to d_points [n, stride] if wanted.
+    /// The VJP of [`forward`](Self::forward): adds to the entries' gradients in `d`, and to d_points [n, stride] if
+    /// requested.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -203,7 +204,7 @@ impl HashGrid {
             );
         });
         let Some(d_points) = d_points else { return };
-        assert_eq!(d_points.len(), points.len(), "a gradient has the shape of what it is of");
+        assert_eq!(d_points.len(), points.len(), "a gradient has the shape of its value");
         let chunks = points.par_chunks(ROWS * self.stride).zip(d_out.data.par_chunks(ROWS * d_out.width));
         chunks.zip(d_points.par_chunks_mut(ROWS * self.stride)).for_each(|((points, data), d_points)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {
@@ -242,7 +243,7 @@ impl<P: LevelPass, const N: usize> Kernel for Fixed<P, N> {
     }
 }
 
-/// With two features an entry, as everyone has them, the compiler knows so.
+/// Two features per entry, the usual number, are a constant for the compiler.
 fn run(simd: Simd, features: usize, pass: impl LevelPass) {
     match features {
         2 => dispatch(simd, Fixed::<_, 2>(pass)),

@@ -4,15 +4,16 @@
 //! channels a level. Sources: Cao and Johnson 2023 (HexPlane); Fridovich-Keil et al. 2023 (K-Planes); Wu et al. 2024
 //! ("4DGaussians"), whose released code multiplies the planes and concatenates the levels.
 //!
-//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and what is outside sees the border and has no
+//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and points outside get the border's value and no
 //! gradient. (The released code sends t in [0, 1] to a grid over [-1, 1] and so never reads half of it; here the whole
 //! grid is time, and half as many time steps are as fine.)
 //!
-//! A plane is one `Space::Fixed` column of H·W·C numbers, `[second axis][first axis][channel]`, so that the channels of a
-//! grid point lie together: a lookup is four short runs of memory. All points of a question have one t, hence a time
+//! A plane is one `Space::Fixed` column of H·W·C numbers, `[second axis][first axis][channel]`, so that the channels of
+//! a grid point are adjacent: a lookup is four short runs of memory. All points of a query have one t, hence a time
 //! plane is first blended to the [`Lines`] of that t: 2 runs from the first-level cache instead of 4 from memory.
 //!
-//! Gradients of grid points are scattered by one task a plane, over rows in order: the same bits for any number of threads.
+//! Gradients of grid points are scattered by one task a plane, over rows in order: the same bits for any number of
+//! threads.
 
 use crate::math::{Real, Rng};
 use crate::scene::{Grads, Key, Params};
@@ -30,7 +31,7 @@ pub const SPATIAL: [usize; 3] = [0, 1, 3];
 /// The planes over x and t, y and t, z and t.
 pub const TEMPORAL: [usize; 3] = [2, 4, 5];
 
-/// Channels are worked on so many at a time.
+/// Channels are worked on this many at a time.
 pub(crate) const LANES: usize = 16;
 /// Most channels: four times what anyone uses.
 const MAX_CHANNELS: usize = 128;
@@ -38,13 +39,14 @@ const MAX_CHANNELS: usize = 128;
 const MAX_LEVELS: usize = 8;
 /// Most grid points along an axis.
 const MAX_RESOLUTION: usize = 4096;
-/// Most numbers in all planes, 1 GiB of f32: a file must not ask for more.
+/// Most numbers in all planes, 1 GiB of f32: a file must not request more.
 const MAX_NUMBERS: usize = 1 << 28;
 /// Planes start between these: about 1, so that a product of six is neither lost nor overwhelming.
 const START: [f64; 2] = [0.5, 1.5];
-/// Random grid points along an axis that the first level's planes start from, the second's from twice as many.
+/// Random grid points along an axis for the start of the first level's planes; twice as many for the second's.
 const START_POINTS: usize = 3;
-/// Rows that a task of the backward looks up before they are scattered; 128 rows of 12 planes of 32 channels are 200 kB.
+/// Rows that a task of the backward looks up before they are scattered; 128 rows of 12 planes of 32 channels are 200
+/// kB.
 const PART_ROWS: usize = 128;
 /// Parts whose gradients wait to be scattered at a time: 3 MB, within the last-level cache.
 const PARTS: usize = 16;
@@ -121,7 +123,7 @@ pub struct Planes {
     keys: Vec<[Key; 6]>,
 }
 
-/// The time planes at one t, and how to go back to them.
+/// The time planes at one t, and the indices for their backward.
 pub struct Lines<F> {
     /// By level: x, y, z; [resolution][channel].
     lines: Vec<[Vec<Lane<F>>; 3]>,
@@ -209,8 +211,8 @@ impl Planes {
         });
     }
 
-    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting` is
-    /// scratch, whatever is in it.
+    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting`
+    /// is scratch, whatever is in it.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -223,10 +225,7 @@ impl Planes {
         d: &mut Grads<F>,
     ) -> F {
         let width = self.shape.features();
-        assert!(
-            d_out.len() == x.len() * width && d_x.len() == x.len(),
-            "gradients have the shapes of what they are of"
-        );
+        assert!(d_out.len() == x.len() * width && d_x.len() == x.len(), "gradients have the shapes of their values");
         let (levels, blocks, simd) = (self.levels(p, lines, unlocked), self.blocks(), Simd::detect());
         let keys: Vec<Key> = self.keys[..levels.len()].as_flattened().to_vec();
         let mut tables = d.many(&keys);
@@ -267,12 +266,12 @@ impl Planes {
     }
 }
 
-/// Fills a plane with bilinear blends of `points` by `points` random numbers a channel. Independent grid points, as the
-/// released code has them, give neighbours unrelated features, and networks train for long before they can separate a
+/// Fills a plane with bilinear blends of `points` by `points` random numbers per channel. Independent grid points, as
+/// in the released code, give neighbours unrelated features, and networks train for long before they can separate a
 /// motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
 fn smooth<F: Real>(data: &mut [F], size: [usize; 2], channels: usize, points: usize, stream: Rng) {
     let counts = size.map(|n| points.min(n));
-    // The random point before a grid point, and how far that is on the way to the next.
+    // The random point before a grid point, and the fraction towards the next.
     let near = |at: usize, axis: usize| {
         let g = at as f64 / (size[axis] - 1) as f64 * (counts[axis] - 1) as f64;
         let before = (g as usize).min(counts[axis] - 2);
@@ -326,7 +325,8 @@ impl<F: Real> Cell<F> {
     }
 }
 
-/// Four grid points around a place, of one run of channels: their blend and its slopes along the first and second axis.
+/// Four grid points around a position, of one run of channels: their blend and its slopes along the first and second
+/// axis.
 #[inline(always)]
 fn bilinear<F: Real>(plane: &[Lane<F>], first: usize, block: usize, row: usize, s: [F; 2]) -> [Lane<F>; 3] {
     let (a, b) = (&plane[first], &plane[first + block]);
@@ -342,7 +342,7 @@ fn bilinear<F: Real>(plane: &[Lane<F>], first: usize, block: usize, row: usize, 
     out
 }
 
-/// Two grid points around a place on a line: their blend and its slope.
+/// Two grid points around a position on a line: their blend and its slope.
 #[inline(always)]
 fn linear<F: Real>(line: &[Lane<F>], first: usize, block: usize, s: F) -> [Lane<F>; 2] {
     let (a, b) = (&line[first], &line[first + block]);

@@ -1,8 +1,8 @@
 //! Matrix products on one thread, in f32 and f64: the one door to `gemm`'s kernels, with every bound checked.
 //!
-//! `gemm-f32` and `gemm-f64` are the two parts of `gemm` that are used: the crate of that name also builds its kernels for
-//! complex numbers and half floats, which is a third of a clean build of everything that is not ours.
-#![allow(unsafe_code)] // the kernels take pointers; every matrix that reaches it was checked to lie in its slice
+//! `gemm-f32` and `gemm-f64` are the two parts of `gemm` that are used: the crate of that name also builds its kernels
+//! for complex numbers and half floats, which is a third of a clean build of everything that is not ours.
+#![allow(unsafe_code)] // the kernels take pointers; every matrix that reaches it was checked to be inside its slice
 
 use crate::math::Real;
 use gemm_common::Parallelism;

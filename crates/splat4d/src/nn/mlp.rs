@@ -2,9 +2,9 @@
 //! are worked on while it is in the cache.
 //!
 //! a₀ = x, aᵢ₊₁ = max(0, aᵢ Wᵢᵀ + bᵢ), out = a_D W_Dᵀ + b_D; where `skip` = s the input of layer s + 1 is [a_{s+1}, x].
-//! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive.
-//! Weight gradients are summed over a fixed number of runs of chunks and then in the order of the runs, so that the bits
-//! do not depend on the number of threads.
+//! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive. Weight gradients are
+//! summed over a fixed number of runs of chunks and then in the order of the runs, so that the bits do not depend on
+//! the number of threads.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; weights start as He et al. 2015 §2.2.
 
 use super::matmul::{Matrix, product};
@@ -26,15 +26,15 @@ pub(crate) const MAX_WEIGHTS: usize = 1 << 24;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MlpShape {
-    /// Numbers that go in.
+    /// Number of inputs.
     pub inputs: usize,
     /// Numbers in a hidden layer; not read where there is none.
     pub width: usize,
     /// Hidden layers.
     pub layers: usize,
-    /// The input stands again behind what this hidden layer (counted from 0) gives.
+    /// The input is appended again to the output of this hidden layer (counted from 0).
     pub skip: Option<usize>,
-    /// Numbers that come out.
+    /// Number of outputs.
     pub outputs: usize,
 }
 
@@ -127,7 +127,7 @@ impl<'a, F> Passed<'a, F> {
 /// The gradient to a network's input, [n, inputs].
 #[derive(Debug)]
 pub enum InputGrad<'a, F> {
-    /// Not wanted.
+    /// Not requested.
     Skip,
     /// Written.
     Overwrite(&'a mut [F]),
@@ -195,8 +195,8 @@ impl Mlp {
         self.forward_shifted(p, x, &[], out, kept);
     }
 
-    /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias of
-    /// map i: what all rows share (a time's features) need not stand in every row.
+    /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias
+    /// of map i: what all rows share (a time's features) need not be repeated in every row.
     pub(crate) fn forward_shifted<F: Real>(
         &self,
         p: &Params<F>,
@@ -208,7 +208,7 @@ impl Mlp {
         let n = self.rows(x, out);
         let biases = self.biases(p, shifts);
         let (rows, hidden) = (self.chunk_rows(), self.hidden());
-        // `forward` asks for nothing to be kept by a count that no pass can have.
+        // `forward` requests nothing to be kept by a count that no pass can have.
         let wanted = if kept.chunks == usize::MAX { 0 } else { n.div_ceil(rows) };
         let per_chunk = rows * hidden;
         kept.chunks = wanted.min(LayerOutputs::<F>::BYTES / size_of::<F>() / per_chunk.max(1));
@@ -249,7 +249,7 @@ impl Mlp {
         let chunks = n.div_ceil(rows);
         let runs = chunks.min(RUNS);
         let inputs = self.shape.inputs;
-        // Every run is so many whole chunks, whichever thread works on it.
+        // Every run is this many whole chunks, whichever thread works on it.
         let ends: Vec<usize> = (0..=runs).map(|r| (r * chunks / runs.max(1) * rows).min(n)).collect();
         let (mut rest, overwrite) = match d_x {
             InputGrad::Skip => (&mut [][..], false),
@@ -257,7 +257,7 @@ impl Mlp {
             InputGrad::Add(d_x) => (d_x, false),
         };
         let wanted = !rest.is_empty();
-        assert!(!wanted || rest.len() == x.len(), "a gradient has the shape of what it is of");
+        assert!(!wanted || rest.len() == x.len(), "a gradient has the shape of its value");
         let mut parts: Vec<&mut [F]> = Vec::new();
         for run in ends.windows(2) {
             let (head, tail) = rest.split_at_mut(if wanted { (run[1] - run[0]) * inputs } else { 0 });
@@ -323,7 +323,7 @@ impl Mlp {
         biases
     }
 
-    /// Whether the last map is zero, so that everything that comes out is; nothing but it has a gradient then.
+    /// Whether the last map is zero, and so are all outputs; only it has a gradient then.
     pub(crate) fn is_zero<F: Real>(&self, p: &Params<F>) -> bool {
         let Map { weight, bias, .. } = self.maps[self.shape.layers];
         [weight, bias].iter().all(|&key| p[key].data().iter().all(|x| *x == F::ZERO))
@@ -346,7 +346,7 @@ impl Mlp {
         (CHUNK_NUMBERS / self.shape.width.max(1)).clamp(CHUNK_ROWS[0], CHUNK_ROWS[1])
     }
 
-    /// Numbers a row that the hidden layers give, with the input where it is next to them.
+    /// Numbers per row that the hidden layers give, with the input where it is next to them.
     fn hidden(&self) -> usize {
         self.maps[1..].iter().map(|m| m.inputs).sum()
     }

@@ -1,8 +1,8 @@
 //! The residual block of a sequence model, for sixteen sequences at a time: LayerNorm → state space, in one or both
 //! directions → GELU → linear → residual.
 //!
-//! Numbers are as [rows, ticks] of lanes, so that a layer that mixes rows is one matrix product for all ticks, and a scan
-//! reads one row from end to end. Gradients of weights are added to; those of activations are written over where a
+//! Numbers are as [rows, ticks] of lanes, so that a layer that mixes rows is one matrix product for all ticks, and a
+//! scan reads one row from end to end. Gradients of weights are added to; those of activations are written over where a
 //! function states so.
 
 use super::matmul::{Matrix, product};
@@ -24,7 +24,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Appends a part of `numbers`; states where it lies.
+    /// Appends a part of `numbers`; returns its position.
     pub(crate) fn push(&mut self, name: String, numbers: usize) -> Range<usize> {
         let at = self.len..self.len + numbers;
         self.len = at.end;
@@ -32,7 +32,7 @@ impl Layout {
         at
     }
 
-    /// Names and places, in order.
+    /// Names and positions, in order.
     pub(crate) fn parts(&self) -> &[(String, Range<usize>)] {
         &self.parts
     }
@@ -188,7 +188,7 @@ pub(crate) fn norm_backward<F: Real>(unit: &[Lane<F>], inverse: &[Lane<F>], d_un
     });
 }
 
-/// One residual block: where its weights lie.
+/// One residual block: positions of its weights.
 #[derive(Clone, Debug)]
 pub(crate) struct Block {
     /// Rows of numbers.
@@ -315,7 +315,7 @@ impl Block {
         &self.scans
     }
 
-    /// First weights: norms as they are, S4D-Lin, uniform linear maps.
+    /// First weights: norms with unit weights, S4D-Lin, uniform linear maps.
     pub(crate) fn init<F: Real>(&self, ticks: usize, rng: Rng, w: &mut [F]) {
         w[self.norm[0].clone()].fill(F::ONE);
         self.scans.init(ticks, rng.fork(1), w);
@@ -343,7 +343,7 @@ impl Block {
         add(x, &step);
     }
 
-    /// VJP of [`forward`](Self::forward): d_x, the gradient to what came out, becomes that to what went in.
+    /// VJP of [`forward`](Self::forward): d_x, the gradient to the output, becomes that to the input.
     pub(crate) fn backward<F: Real>(
         &self,
         w: &[F],

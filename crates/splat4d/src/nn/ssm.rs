@@ -1,9 +1,9 @@
 //! A diagonal complex state-space layer (S4D): sixteen sequences at a time, each with its own channels.
 //!
-//! h'(τ) = Λh + Bu, y = Re(Ch) + Du with Λ = −exp(a) + iω, held constant over a tick (zero-order hold):
-//! hₙ = Āhₙ₋₁ + B̄uₙ, z = ΔΛ·gap, Ā = e^z, B̄ = Δ·gap·φ(z)·B, φ(z) = (e^z − 1)/z. Real parts of Λ are negative by
-//! construction, hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept but
-//! made again, [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
+//! h'(τ) = Λh + Bu, y = Re(Ch) + Du with Λ = −exp(a) + iω, held constant over a tick (zero-order hold): hₙ = Āhₙ₋₁ +
+//! B̄uₙ, z = ΔΛ·gap, Ā = e^z, B̄ = Δ·gap·φ(z)·B, φ(z) = (e^z − 1)/z. Real parts of Λ are negative by construction,
+//! hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept but made again,
+//! [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
 //!
 //! Source: Gu et al. 2022 (S4D). Gradients of complex numbers are ∂L/∂Re + i·∂L/∂Im throughout.
 
@@ -17,7 +17,7 @@ pub(crate) const LANES: usize = BLOCK;
 pub(crate) const CHUNK: usize = 16;
 /// Below this |z| the quotients φ and φ' are taken from their series (the terms left out are below 1e-15).
 const SERIES: f64 = 1e-2;
-/// Ā falls to e^-40 at most in a tick: what decays faster is gone anyway, and 0/0 is not met.
+/// Ā falls to e^-40 at most in a tick: faster decay makes no difference, and 0/0 is avoided.
 const STRONGEST_DECAY: f64 = 40.0;
 /// Steps are at most e³ ticks, whatever a file states.
 const LONGEST_LOG_STEP: f64 = 3.0;
@@ -102,17 +102,18 @@ impl<'a, F> Slices<'a, F> {
 /// Direction of a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Direction {
-    /// From the first tick to the last: sees the past.
+    /// From the first tick to the last: uses the past.
     Forward,
-    /// From the last tick to the first: sees the future.
+    /// From the last tick to the first: uses the future.
     Backward,
 }
 
-/// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to it.
+/// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to
+/// it.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Discrete<F> {
     shape: Shape,
-    /// 1 where ticks are evenly spaced, else one a tick.
+    /// 1 where ticks are evenly spaced, else one per tick.
     gaps: usize,
     decay: Vec<Complex<F>>,
     drive: Vec<Complex<F>>,
@@ -131,7 +132,7 @@ struct Hold {
 impl Hold {
     fn new(log_decay: f64, frequency: f64, log_step: f64, gap: f64) -> Self {
         let step = log_step.min(LONGEST_LOG_STEP).exp();
-        // ωΔ above π aliases: such a mode stands at the fastest that ticks can show.
+        // ωΔ above π aliases: such a mode gets the fastest frequency that ticks can show.
         let turn = (frequency * step).clamp(-std::f64::consts::PI, std::f64::consts::PI);
         let decay = (log_decay.exp() * step).min(STRONGEST_DECAY / gap.max(1.0));
         Self {
@@ -181,8 +182,8 @@ fn against(a: Complex<f64>, b: Complex<f64>) -> Complex<f64> {
 }
 
 impl<F: Real> Discrete<F> {
-    /// Of a layer's weights. `gaps`: time since the tick before, in ticks: one number for evenly spaced ones, else one a
-    /// tick (the first as the others; a scan backwards takes the gap to the tick after).
+    /// Of a layer's weights. `gaps`: time since the tick before, in ticks: one number for evenly spaced ones, else one
+    /// a tick (the first as the others; a scan backwards takes the gap to the tick after).
     pub(crate) fn new(shape: Shape, w: &[F], gaps: &[f64]) -> Self {
         let mut out = Self::zeros(shape, gaps.len());
         let mut w = w.to_vec();
@@ -294,7 +295,7 @@ impl<F: Real> Discrete<F> {
         out
     }
 
-    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what stood before the first tick and becomes what stands
+    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is the state before the first tick and becomes that
     /// after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
     pub(crate) fn scan(
         &self,
@@ -316,8 +317,8 @@ impl<F: Real> Discrete<F> {
         }
     }
 
-    /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to what
-    /// stood after the last tick and becomes that to what stood before the first.
+    /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to
+    /// the state after the last tick and becomes that to the state before the first.
     #[expect(
         clippy::too_many_arguments,
         reason = "a scan's backward has all that its forward has, and their gradients"
@@ -531,7 +532,7 @@ impl<F: Real> Kernel for &mut Reverse<'_, '_, F> {
 }
 
 impl<F: Real> Reverse<'_, '_, F> {
-    /// Adds the sums over lanes to the gradient, for the gap whose first state stands at `place`.
+    /// Adds the sums over lanes to the gradient, for the gap whose first state is at `place`.
     fn flush(&mut self, place: usize) {
         for (i, [d_a, d_b, d_c]) in self.sums.iter_mut().enumerate() {
             for k in 0..2 {

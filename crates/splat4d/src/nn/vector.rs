@@ -1,8 +1,9 @@
 //! Vector neurons: layers whose numbers are vectors of space, and which turn and mirror with them exactly.
 //!
-//! A vector channel is three rows, [channels, 3, ticks] of lanes. Linear maps mix channels and leave x, y, z alone, hence
-//! commute with every orthogonal matrix; so does a linear recurrence in time whose numbers are shared by the three (a
-//! state-space layer with three copies). Nonlinear are the VN-ReLU, q − ⟨q,k⟩k/‖k‖² where ⟨q,k⟩ < 0, and gates by norms.
+//! A vector channel is three rows, [channels, 3, ticks] of lanes. Linear maps mix channels and leave x, y, z alone,
+//! hence commute with every orthogonal matrix; so does a linear recurrence in time whose numbers are shared by the
+//! three (a state-space layer with three copies). Nonlinear are the VN-ReLU, q − ⟨q,k⟩k/‖k‖² where ⟨q,k⟩ < 0, and gates
+//! by norms.
 //!
 //! Source: Deng et al. 2021 (vector neurons); the equivariant state space is our own.
 
@@ -252,7 +253,7 @@ impl VectorBlock {
         add(x, &step);
     }
 
-    /// VJP of [`forward`](Self::forward): d_x, the gradient to what came out, becomes that to what went in.
+    /// VJP of [`forward`](Self::forward): d_x, the gradient to the output, becomes that to the input.
     pub(crate) fn backward<F: Real>(
         &self,
         w: &[F],

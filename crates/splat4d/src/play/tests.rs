@@ -28,7 +28,7 @@ fn primitive(rng: &Rng, center: f64, half_width: f64) -> Primitive {
     }
 }
 
-/// A root that lives for ever and a node a second.
+/// A root that has an infinite lifespan and a node a second.
 fn take() -> Vec<u8> {
     let rng = Rng::new(3, "play", 0);
     let mut nodes = vec![Node { from: 0.0, to: CLIP + 0.1, primitives: Vec::new() }];
@@ -61,7 +61,7 @@ impl ReadAt for Counted {
 }
 
 #[test]
-fn a_player_shows_exactly_what_the_scene_holds() {
+fn a_player_shows_exactly_the_scene() {
     let file = take();
     let scene = read(&file).unwrap();
     let mut whole = Player::of_scene(&scene);
@@ -81,10 +81,10 @@ fn a_player_shows_exactly_what_the_scene_holds() {
 }
 
 #[test]
-fn a_layer_that_lives_for_ever_is_shown_whole() {
+fn a_layer_with_infinite_lifespans_is_shown_whole() {
     let mut params = crate::scene::Params::new(3, 1, &[]);
     let motion = crate::motion::build(&crate::motion::Spec::Still, &mut params).unwrap();
-    // A model may raise an opacity that is next to nothing as it is learnt: the lookup must not judge by it.
+    // A model may raise an opacity whose raw value is nearly zero: the lookup must not judge by it.
     params[crate::scene::GEOMETRY].set(1, crate::scene::params::OPACITY, -20.0);
     let life = crate::scene::LifeKind::Infinite;
     for span in [ALWAYS, [0.5, 2.0]] {

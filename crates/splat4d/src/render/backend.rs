@@ -1,5 +1,6 @@
-//! The seam between a scene and whatever draws it: [`Backend`], implemented by the renderer of the CPU, by the oracle and
-//! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by name.
+//! The seam between a scene and whatever renders it: [`Backend`], implemented by the renderer of the CPU, by the oracle
+//! and (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command name none of them
+//! directly.
 
 use super::compare::{Comparison, Target};
 use super::resident::Resident;
@@ -8,9 +9,9 @@ use crate::math::{Real, sh};
 use crate::scene::{Camera, Splats, Table};
 use crate::{Error, ErrorKind, Result};
 
-/// Abilities that not every backend has. Colour, alpha and depth over a background are drawn by all.
+/// Abilities that not every backend has. Colour, alpha and depth over a background are rendered by all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct Abilities {
     /// Further channels ([`Shot::extra`]).
     pub extra: bool,
     /// A pixel head ([`Splats::head`]).
@@ -21,7 +22,7 @@ pub struct Wanted {
     pub compare: bool,
 }
 
-/// An image to draw.
+/// An image to render.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a, F = f32> {
     /// The scene at one time.
@@ -32,9 +33,9 @@ pub struct Shot<'a, F = f32> {
     pub background: [F; 3],
     /// Further channels to blend, [all splats, C].
     pub extra: Option<&'a Table<F>>,
-    /// Highest degree of spherical harmonics drawn, lowered to what a table holds.
+    /// Highest degree of spherical harmonics rendered, lowered to what a table holds.
     pub sh_degree: usize,
-    /// Whether [`Image::depth`] is drawn; on the CPU it takes a further pass over the pixels.
+    /// Whether [`Image::depth`] is rendered; on the CPU it takes a further pass over the pixels.
     pub depth: bool,
 }
 
@@ -44,9 +45,9 @@ impl<'a, F: Real> Shot<'a, F> {
         Self { splats, camera, background, extra: None, sh_degree: sh::MAX_DEGREE, depth: false }
     }
 
-    /// Abilities that drawing it takes.
-    pub(crate) fn wanted(&self) -> Wanted {
-        Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Wanted::default() }
+    /// Abilities that rendering it takes.
+    pub(crate) fn abilities(&self) -> Abilities {
+        Abilities { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Abilities::default() }
     }
 }
 
@@ -61,20 +62,20 @@ pub enum Tables {
     Constant,
 }
 
-/// Draws splats and takes gradients back; memory is reused from image to image.
+/// Renders splats and takes gradients back; memory is reused from image to image.
 pub trait Backend<F: Real = f32>: Send {
     /// Whether it has these abilities. Errors: it lacks one; the message names it and states what can.
-    fn can(&self, wanted: &Wanted) -> Result<()>;
+    fn can(&self, abilities: &Abilities) -> Result<()>;
 
-    /// Draws into `out`, which is resized to the camera's image. Rows that are NaN, infinite, behind the camera or
-    /// transparent are not drawn.
+    /// Renders into `out`, which is resized to the camera's image. Rows that are NaN, infinite, behind the camera or
+    /// transparent are not rendered.
     ///
     /// Errors: what [`can`](Self::can) refuses; an image too large for the device; a driver that failed. `out` means
     /// nothing then. Panics: `extra` has not one row a splat.
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()>;
 
-    /// Draws as [`render`](Self::render) does, but in 8 bits: red, green, blue and alpha of every pixel, clamped and rounded,
-    /// which is less to bring back from a device. `false`: it has no such way, and nothing was done.
+    /// Renders as [`render`](Self::render) does, but in 8 bits: red, green, blue and alpha of every pixel, clamped and
+    /// rounded, which is less to bring back from a device. `false`: it has no such way, and nothing was done.
     ///
     /// Errors: as of `render`.
     fn render_bytes(&mut self, shot: &Shot<'_, F>, out: &mut Vec<[u8; 4]>) -> Result<bool> {
@@ -95,9 +96,8 @@ pub trait Backend<F: Real = f32>: Send {
         d: &mut RenderGrads<F>,
     ) -> Result<()>;
 
-    /// Draws, compares with the truth and takes the gradient of that loss back, without the image ever leaving the
-    /// device.
-    /// Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
+    /// Renders, compares with the truth and takes the gradient of that loss back, without the image ever leaving the
+    /// device. Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
     ///
     /// Errors: as of `render`. Panics: the truth has another size than the camera's image.
     fn compare(
@@ -111,22 +111,22 @@ pub trait Backend<F: Real = f32>: Send {
         Ok(None)
     }
 
-    /// Where whole steps are taken on the device, on tables that stay there; none: it has no such way.
+    /// The interface for whole steps on tables that stay on the device; none: unsupported.
     fn resident(&mut self) -> Option<&mut dyn Resident> {
         None
     }
 
-    /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty
-    /// where the backend has no backward pass.
+    /// Radius of every splat of the last render with a backward pass: 3σ of the larger axis, pixels; 0: not rendered.
+    /// Empty where the backend has no backward pass.
     fn radii(&self) -> &[F];
 
-    /// The limits that it draws with.
+    /// The limits that it renders with.
     fn config(&self) -> &RenderConfig;
 
     /// The device, in a word or two.
     fn name(&self) -> &str;
 
-    /// What happened since the last call that the user should know, in one line: what is drawn elsewhere, and why.
+    /// A message for the user since the last call, one line: what is rendered elsewhere, and why.
     fn notice(&mut self) -> Option<String> {
         None
     }
@@ -138,8 +138,8 @@ pub(crate) fn refusal(who: &str, what: &str) -> Error {
 }
 
 impl<F: Real> Backend<F> for Renderer<F> {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        if abilities.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {

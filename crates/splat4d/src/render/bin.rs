@@ -20,7 +20,7 @@ pub(super) const MASK_SIDE: usize = 8;
 /// Set in a footprint's first column: it is a rectangle larger than a mask.
 const LARGE: u16 = 1 << 15;
 
-/// Pairs of bin and splat that are held at once. An image with more is drawn in runs of bins, each of at most this
+/// Pairs of bin and splat that are held at once. An image with more is rendered in runs of bins, each of at most this
 /// many pairs (or a single bin, whose pairs are at most the splats). A pair holds about 130 bytes in f32 with
 /// gradients, so this is about 2 GiB; ordinary scenes of a million splats have a fifth of it.
 pub(crate) const PAIR_BUDGET: usize = 1 << 24;
@@ -75,7 +75,7 @@ impl Footprint {
         }
     }
 
-    /// Number of touched bins that come before bin (x, y), which is one of them.
+    /// Number of touched bins before bin (x, y), which is one of them.
     #[inline(always)]
     pub(crate) fn rank(&self, x: usize, y: usize) -> usize {
         match self.large() {
@@ -146,7 +146,7 @@ impl Footprint {
     }
 }
 
-/// Sorted lists of splats, one a bin; every buffer is kept from step to step.
+/// Sorted lists of splats, one per bin; every buffer is kept from step to step.
 #[derive(Debug, Default)]
 pub struct Bins {
     /// Bins across.
@@ -165,13 +165,13 @@ pub struct Bins {
     pub keys: Vec<u64>,
     /// The pair of splat i in the bin of rank r has gradient slot `first[i] + r`, wrapping.
     pub first: Vec<u32>,
-    /// Of each chunk of splats and each bin: first the pairs, then where the next of them goes in `staged`.
+    /// Of each chunk of splats and each bin: first the pairs, then the index of the next one in `staged`.
     cursors: Vec<u32>,
-    /// Scratch: the next place of each bin.
+    /// Scratch: the next position of each bin.
     next: Vec<u32>,
     /// Gradient slots before each chunk.
     chunk_starts: Vec<u32>,
-    /// Keys by bin, not yet sorted. Every place is written by exactly one task.
+    /// Keys by bin, not yet sorted. Every position is written by exactly one task.
     staged: Vec<AtomicU64>,
 }
 
@@ -325,7 +325,7 @@ impl Bins {
         if run.is_empty() {
             return self.keys.clear();
         }
-        // A bin's keys are those of the first chunk, then those of the second, and so on: counts become places.
+        // A bin's keys are those of the first chunk, then those of the second, and so on: counts become positions.
         let starts = &mut self.starts[run.start..];
         for counts in self.cursors.chunks(run.len()) {
             for (start, &count) in starts[1..].iter_mut().zip(counts) {

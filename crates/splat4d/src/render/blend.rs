@@ -1,7 +1,7 @@
 //! Blending one bin of 32² pixels, and the backward pass.
 //!
-//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states which
-//! splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
+//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states
+//! which splats can touch it, and for each of these its rows of pixels are processed by one loop over eight lanes.
 //!
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
@@ -40,7 +40,7 @@ pub(super) type Plane<F> = [F; TILE * TILE];
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tile<F> {
-    /// Transmittance; negated once a pixel has stopped.
+    /// Transmittance; negated once per pixel has stopped.
     pub t: Plane<F>,
     /// Σ channel·α·T.
     pub color: [Plane<F>; CHANNELS],
@@ -292,7 +292,7 @@ impl<F: Real, const N: usize> Visit<F> for Forward<'_, F, N> {
         let (tx, ty) = (t % SIDE, t / SIDE);
         let range = strip_range::<N>(r.tile_rows(tx, ty));
         let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &self.limits);
-        // Copies, of which LLVM knows that no store changes them.
+        // Copies, so that LLVM can assume that no store changes them.
         let ([red, green, blue], limits) = (r.channels, self.limits);
         let Tile { t, color } = &mut self.tiles[t];
         let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
@@ -347,7 +347,7 @@ const VXY: usize = 4;
 const VYY: usize = 5;
 /// … the channels' gradients …
 const LIGHT: usize = 6;
-/// … and, where asked for, the absolute gradients to the centre.
+/// … and, where requested, the absolute gradients to the centre.
 const ABS: usize = LIGHT + CHANNELS;
 /// Numbers in a record.
 const NUMBERS: usize = ABS + 2;
@@ -393,7 +393,7 @@ impl<F: Real> Pair<F> {
         [-(a * vx + b * vy), -(b * vx + c * vy)]
     }
 
-    /// Σ of |gradient to the centre|, 0 where it was not asked for.
+    /// Σ of |gradient to the centre|, 0 where it was not requested.
     #[inline(always)]
     pub(crate) fn center_abs(&self) -> [F; 2] {
         // The records' conic is in powers of 2.
@@ -424,7 +424,7 @@ pub(super) struct Backward<'a, F> {
     /// The image's width and height.
     pub size: [usize; 2],
     pub limits: Limits<F>,
-    /// Whether absolute gradients are wanted.
+    /// Whether absolute gradients are needed.
     pub abs: bool,
     /// One a record; those that no pixel meets are not written.
     pub out: &'a mut [Pair<F>],
@@ -446,9 +446,9 @@ impl<F: Real> Kernel for Backward<'_, F> {
 #[repr(C, align(64))]
 #[derive(Clone, Copy)]
 struct Back<F> {
-    /// Transmittance in front of the splat in hand; negated once a pixel has stopped.
+    /// Transmittance in front of the splat in hand; negated once per pixel has stopped.
     t: Plane<F>,
-    /// Σ_ch g_ch·(light that is still to come): one number serves all channels and alpha.
+    /// Σ_ch g_ch·(remaining light): one number serves all channels and alpha.
     rest: Plane<F>,
     /// Gradient to the channels.
     g: [Plane<F>; CHANNELS],
@@ -544,7 +544,7 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Returning<'_, F
         let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
         let range = strip_range::<N>(r.tile_rows(tx, ty));
         let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
-        // Copies, of which LLVM knows that no store changes them.
+        // Copies, so that LLVM can assume that no store changes them.
         let (channels, [a, b, c], alpha_max) = (r.channels, [r.a, r.b, r.c], self.alpha_max);
         let (mut dy, dx) = (e.dy, offsets::<F, N>(r, tx));
         // In two loops: the second waits for T from splat to splat, and while it does the first, which waits for

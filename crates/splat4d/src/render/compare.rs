@@ -1,8 +1,8 @@
-//! What an image is compared with on a device, and the result.
+//! A comparison of an image on a device, and its result.
 
 use crate::scene::Planes;
 
-/// What an image is compared with, and how: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
+/// Truth and weights of a comparison: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
 #[derive(Clone, Copy, Debug)]
 pub struct Target<'a, F = f32> {
     /// The truth, [3, h, w].
@@ -13,7 +13,7 @@ pub struct Target<'a, F = f32> {
     pub picture: usize,
     /// λ: the share of 1 − SSIM.
     pub dssim: f64,
-    /// How the camera shows what is drawn: a matrix without the identity, row by row, then an offset a channel.
+    /// How the camera shows what is rendered: a matrix without the identity, row by row, then an offset per channel.
     pub response: Option<[F; 12]>,
 }
 

@@ -1,11 +1,11 @@
 //! The feature head, pixel by pixel: nine blended channels and the pixel's ray become colour.
 //!
 //! With the blended base colour b (over the background), the blended view features f and time features g, the camera's
-//! centre o and the pixel's direction r (unit, world axes), colour = σ(logit b + W₂ relu(W₁ [f, g, o/(1 + ‖o‖), r])), W₁ 6x12,
-//! W₂ 3x6, no biases. Where W₂ is zero, which is the start, colours are those of a scene without a head.
+//! centre o and the pixel's direction r (unit, world axes), colour = σ(logit b + W₂ relu(W₁ [f, g, o/(1 + ‖o‖), r])),
+//! W₁ 6x12, W₂ 3x6, no biases. Where W₂ is zero, which is the start, colours are those of a scene without a head.
 //!
-//! Source: Li et al. 2024 (Spacetime Gaussians) §4.1. Ours: theirs blends logits, ours blends colours and takes the logit
-//! of what comes out, so that the head starts as the identity, transparency mixes colours as everywhere else, and the
+//! Source: Li et al. 2024 (Spacetime Gaussians) §4.1. Ours: theirs blends logits, ours blends colours and takes the
+//! logit of the output, so that the head starts as the identity, transparency mixes colours as everywhere else, and the
 //! background needs no logit; and origins are squashed, so that the unit of length matters little.
 
 use super::simd::{Kernel, Simd, dispatch, select};
@@ -86,8 +86,8 @@ impl<F: Real> Headed<F> {
         });
     }
 
-    /// The VJP of [`forward`](Self::forward): fills the gradients to base colours and further channels (`d_extra` is the
-    /// caller's part of them) and returns those of the weights and, to a left perturbation, of the pose.
+    /// The VJP of [`forward`](Self::forward): fills the gradients to base colours and further channels (`d_extra` is
+    /// the caller's part of them) and returns those of the weights and, to a left perturbation, of the pose.
     pub(crate) fn backward(
         &mut self,
         head: HeadWeights<'_, F>,
@@ -308,8 +308,8 @@ impl<F: Real> Net<F> {
     }
 }
 
-/// σ(logit c + z), and 1/(c̄(1 − c̄)), the slope of the logit; c̄ is c kept within [`NEAREST`] of 0 and 1, beyond which the
-/// logit goes on as a straight line.
+/// σ(logit c + z), and 1/(c̄(1 − c̄)), the slope of the logit; c̄ is c kept within [`NEAREST`] of 0 and 1, beyond which
+/// the logit continues as a straight line.
 #[inline(always)]
 fn shade<F: Real>(c: F, z: F) -> (F, F) {
     let (low, high) = (F::of(NEAREST), F::of(1.0 - NEAREST));

@@ -1,16 +1,16 @@
 //! The importance of each splat to an image, in three scores that one walk as forward's sums over the pixels.
 //!
-//! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
-//! the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
-//! without the
-//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact for one splat
-//! alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes little.
+//! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel,
+//! which the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
+//! without the splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact
+//! for one splat alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and
+//! changes little.
 //!
-//! *Sensitivity*: how strongly the image answers to a splat. A pixel's channels depend on its shape through ln α alone,
-//! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a polynomial
-//! s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the moments
-//! Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for scores, not for
-//! steps.
+//! *Sensitivity*: how strongly the image depends on a splat. A pixel's channels depend on its shape through ln α alone,
+//! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a
+//! polynomial s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the
+//! moments Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums per splat, exact. Slow and clear: it is meant for
+//! scores, not for steps.
 
 use super::Renderer;
 use super::bin::{BIN, id};
@@ -37,15 +37,15 @@ const POWERS: [[usize; 2]; 12] =
 /// The moments, and Σ of (Σ_c v_c²)/α².
 const MOMENTS: usize = POWERS.len() + 1;
 
-/// The answer of an image to changes of one splat.
+/// The result of an image to changes of one splat.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sensitivity {
-    /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3, world) and
-    /// the standard deviations along the covariance's axes (3, longest first), scene units⁻². Colour does not count as
-    /// depending on the direction. Source: PUP 3D-GS (Hanson et al. 2025), its spatial Fisher block.
+    /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3,
+    /// world) and the standard deviations along the covariance's axes (3, longest first), scene units⁻². Colour does
+    /// not count as depending on the direction. Source: PUP 3D-GS (Hanson et al. 2025), its spatial Fisher block.
     pub fisher: [f64; 21],
-    /// Σ over pixels and channels of (dI/dg)², g the splat's bare bell e^(−½ dᵀ Q d). Source: Speedy-Splat (Hanson et al.
-    /// 2025), its efficient pruning score.
+    /// Σ over pixels and channels of (dI/dg)², g the splat's bare bell e^(−½ dᵀ Q d). Source: Speedy-Splat (Hanson et
+    /// al. 2025), its efficient pruning score.
     pub squared: f64,
 }
 
@@ -81,7 +81,7 @@ impl Importance {
         self.renderer.sensitivities(shot, out);
     }
 
-    /// Splats as a camera sees them, before any is blended, one a splat.
+    /// Splats as a camera sees them, before any is blended, one per splat.
     pub(crate) fn project(&mut self, splats: &Splats<'_>, camera: &Camera) -> &[Projected] {
         self.renderer.list(splats, camera);
         self.renderer.projected()
@@ -96,37 +96,33 @@ impl Importance {
 impl<F: Real> Renderer<F> {
     /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is examined.
     ///
-    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows it. Draws no image; no backward may follow.
-    /// Costs
-    /// less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score of
-    /// 4DGS-1K (Yuan et al. 2025).
+    /// `out` is overwritten, one per splat; exactly 0 where no pixel shows it. Renders no image; no backward may
+    /// follow. Costs less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the
+    /// spatial score of 4DGS-1K (Yuan et al. 2025).
     pub(crate) fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
         self.list(splats, camera);
         self.last_contributions(out);
     }
 
-    /// `Renderer::contributions` of what was drawn last. A backward may still follow.
+    /// `Renderer::contributions` of what was rendered last. A backward may still follow.
     pub(crate) fn last_contributions(&mut self, out: &mut Vec<F>) {
         self.score_all::<Contribution>(None, out);
     }
 
-    /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one a splat,
-    /// exact
-    /// for each alone.
+    /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one per splat,
+    /// exact for each alone.
     ///
     /// Neither head nor further channels are examined: it is the base colours' image that changes. `out` is
-    /// overwritten,
-    /// one a splat. Draws by itself; no backward may follow.
+    /// overwritten, one per splat. Renders on its own; no backward may follow.
     pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
     }
 
-    /// The strength of the image's answer to each splat: exact sums over its pixels, for splats that stay in front
-    /// of and
+    /// The sensitivity of the image to each splat: exact sums over its pixels, for splats that stay in front of and
     /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
-    /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.
+    /// `out` is overwritten, one per splat; zeros where no pixel shows it. Renders on its own; no backward may follow.
     pub fn sensitivities(&mut self, shot: &Shot<'_, F>, out: &mut Vec<Sensitivity>) {
         let view = self.list_and_blend(shot);
         let splats = shot.splats;
@@ -208,8 +204,9 @@ impl<F: Real> Renderer<F> {
 }
 
 impl<F: Real> Raster<F> {
-    /// Sums a score over the pixels of every splat that was prepared, after [`Raster::blend`] of the same pass where the score
-    /// looks at colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its bins.
+    /// Sums a score over the pixels of every splat that was prepared, after [`Raster::blend`] of the same pass where
+    /// the score uses colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its
+    /// bins.
     fn score<S: Score<F, NUMBERS>, const NUMBERS: usize, A: Send>(
         &mut self,
         pass: &Pass<'_, F>,
@@ -271,11 +268,11 @@ struct Pixel<F> {
     alpha: F,
     /// α T; 0 where the pixel has stopped.
     weight: F,
-    /// α T c, c the splat's colour; only where the score looks at colours.
+    /// α T c, c the splat's colour; only where the score uses colours.
     own: [F; CHANNELS],
     /// α/(1 − α) times what the pixel shows of all that is behind: α T b. As `own`; 0 where the pixel has stopped.
     hidden: [F; CHANNELS],
-    /// Whether α follows the splat here: it does not where nothing is drawn or α is at its maximum.
+    /// Whether α follows the splat here: it does not where nothing is rendered or α is at its maximum.
     felt: bool,
     /// The splat's centre less the pixel's, pixels.
     offset: [F; 2],
@@ -283,7 +280,7 @@ struct Pixel<F> {
 
 /// `NUMBERS` sums a splat.
 trait Score<F, const NUMBERS: usize>: Sync {
-    /// Whether it looks at [`Pixel::own`] and [`Pixel::hidden`].
+    /// Whether it uses [`Pixel::own`] and [`Pixel::hidden`].
     const COLORS: bool;
     /// The terms of one pixel.
     fn of(pixel: &Pixel<F>) -> [F; NUMBERS];
@@ -340,8 +337,8 @@ impl<F: Real> Score<F, MOMENTS> for Moments {
     }
 }
 
-/// The score of one bin: a walk as forward's that, for a score of colours, knows at every pixel the light of all that lies
-/// behind each splat.
+/// The score of one bin: a traversal as in the forward pass that, for a score of colours, has at every pixel the light
+/// of all that is behind each splat.
 struct Walk<'a, F, S, const NUMBERS: usize> {
     records: &'a [Record<F>],
     /// As the blend left them.
@@ -372,7 +369,7 @@ impl<F: Real, S: Score<F, NUMBERS>, const NUMBERS: usize> Walk<'_, F, S, NUMBERS
     fn walk<const FMA: bool, const N: usize>(self) {
         let mut tiles = [Tile::default(); TILES];
         let open = begin(&mut tiles, self.inside);
-        // From here on a tile's colour is the light that is still to come.
+        // From here on a tile's colour is the remaining light.
         for (tile, drawn) in tiles.iter_mut().zip(self.tiles).filter(|_| S::COLORS) {
             for (c, rest) in tile.color.iter_mut().enumerate() {
                 for (rest, (light, t)) in rest.iter_mut().zip(drawn.color[c].iter().zip(&drawn.t)) {
@@ -456,7 +453,7 @@ impl<F: Real, S: Score<F, NUMBERS>, const N: usize, const NUMBERS: usize> Visit<
     }
 }
 
-/// J M Jᵀ: M the moments of s sᵀ, J the way from (μ, Q) to mean and standard deviations.
+/// J M Jᵀ: M the moments of s sᵀ, J the Jacobian from (μ, Q) to mean and standard deviations.
 fn fisher<F: Real>(
     view: &View<F>,
     (mean, cov, opacity): ([F; 3], [F; 6], F),
@@ -488,7 +485,7 @@ fn fisher<F: Real>(
         }
         let g = project_backward(view, mean, cov, opacity, row, &d);
         let h = g.cov.map(F::f64);
-        // d/d s_k of Σ s² v vᵀ is 2 s v vᵀ; a packed off-diagonal stands for both places.
+        // d/d s_k of Σ s² v vᵀ is 2 s v vᵀ; a packed off-diagonal represents both positions.
         let along = |n: usize| {
             let v = [axes[0][n], axes[1][n], axes[2][n]];
             let quadratic = h[0] * v[0] * v[0] + h[3] * v[1] * v[1] + h[5] * v[2] * v[2];

@@ -5,10 +5,10 @@
 //! Four stages, each public with its VJP: [`project`] (Gaussian → screen ellipse and the bins it touches), [`shade`]
 //! (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs them over
 //! one arena that is reused from step to step. [`oracle`] is the slow f64 definition that they are tested against. The
-//! renderer never sees time.
+//! renderer does not depend on time.
 //!
-//! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
-//! added atomically.
+//! The result has the same bits for any number of threads: every floating-point sum has a fixed order, and nothing is
+//! ever added atomically.
 //!
 //! A network in [`Splats::head`](crate::scene::Splats::head) makes colours of blended channels (`head.rs`), with
 //! gradients.
@@ -32,7 +32,7 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Shot, Tables, Wanted};
+pub use backend::{Abilities, Backend, Shot, Tables};
 pub use compare::{Comparison, Target};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
@@ -79,7 +79,7 @@ pub struct RenderConfig {
     pub antialias: Antialias,
     /// Whether the backward pass sums absolute gradients ([`RenderGrads::mean2d_abs`]).
     pub abs_grads: bool,
-    /// Instructions to use; lowered to what the machine has.
+    /// Instructions to use; lowered to those of the machine.
     pub simd: Simd,
 }
 
@@ -89,7 +89,7 @@ const ALPHA_FLOOR: f64 = 1e-30;
 const ALPHA_CEILING: f64 = 1.0 - 1e-6;
 
 impl RenderConfig {
-    /// The cut-off and the ceiling of α that are drawn with.
+    /// The cut-off and the ceiling of α that are rendered with.
     pub(crate) fn alpha_limits(&self) -> [f64; 2] {
         [self.alpha_min.max(ALPHA_FLOOR), self.alpha_max.min(ALPHA_CEILING)]
     }
@@ -150,7 +150,7 @@ pub struct ImageGrads<'a, F = f32> {
 /// Gradients to one part of the splats, in its compact rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PartGrads<F = f32> {
-    /// [splats, 10]: mean 3, covariance 6 (an off-diagonal stands for both its places), opacity 1.
+    /// [splats, 10]: mean 3, covariance 6 (an off-diagonal represents both its positions), opacity 1.
     pub out: Table<F>,
     /// To direct colours [splats, C], or to SH that is not the layer's own [splats, 3·K·blocks].
     pub color: Option<Table<F>>,
@@ -158,10 +158,10 @@ pub struct PartGrads<F = f32> {
     pub weights: Option<Table<F>>,
 }
 
-/// Gradients to everything that was drawn.
+/// Gradients to everything that was rendered.
 #[derive(Clone, Debug, Default)]
 pub struct RenderGrads<F = f32> {
-    /// One a part.
+    /// One per part.
     pub parts: Vec<PartGrads<F>>,
     /// To the further channels, [all splats, C].
     pub extra: Option<Table<F>>,
@@ -208,7 +208,7 @@ pub struct StageSeconds {
     pub splats_backward: f64,
 }
 
-/// Draws splats and keeps what the backward pass needs. All memory is reused from call to call.
+/// Renders splats and keeps what the backward pass needs. All memory is reused from call to call.
 #[derive(Debug)]
 pub struct Renderer<F = f32> {
     /// Options; may be changed between renders, not between a render and its backward.
@@ -253,7 +253,7 @@ impl<F: Real> Renderer<F> {
         }
     }
 
-    /// Draws a shot; see [`Backend::render`], which never fails here.
+    /// Renders a shot; see [`Backend::render`], which never fails here.
     pub fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
         if let Some(extra) = shot.extra {
             assert_eq!(extra.rows(), shot.splats.len(), "further channels need one row a splat");
@@ -268,7 +268,7 @@ impl<F: Real> Renderer<F> {
         self.headed = headed;
     }
 
-    /// Draws a shot without its head.
+    /// Renders a shot without its head.
     fn blend(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) {
         let Shot { splats, camera, background, extra, sh_degree, .. } = *shot;
         let n = splats.len();
@@ -496,12 +496,12 @@ impl<F: Real> Renderer<F> {
         geometry
     }
 
-    /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not drawn.
+    /// Radius of every splat of the last render: 3σ of the larger axis, pixels; 0: not rendered.
     pub(crate) fn radii(&self) -> &[F] {
         &self.radii
     }
 
-    /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
+    /// Screen ellipses of the last render, one per splat; radius 0: not rendered.
     pub(crate) fn projected(&self) -> &[Projected<F>] {
         &self.projected
     }
@@ -538,7 +538,7 @@ impl<F: Real> Renderer<F> {
     }
 }
 
-/// First channels of the passes after that of the colours: depth, if it is drawn, then what the caller gave.
+/// First channels of the passes after that of the colours: depth, if it is rendered, then what the caller gave.
 fn passes<F: Real>(shot: &Shot<'_, F>) -> impl DoubleEndedIterator<Item = usize> + use<F> {
     let count = usize::from(shot.depth) + shot.extra.map_or(0, Table::width);
     (0..count.div_ceil(CHANNELS)).map(|pass| pass * CHANNELS)

@@ -2,7 +2,7 @@
 //!
 //! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
 
-use super::backend::{Backend, Shot, Wanted, refusal};
+use super::backend::{Abilities, Backend, Shot, refusal};
 use super::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads};
 use crate::Result;
 use crate::math::{Real, se3, sh};
@@ -26,7 +26,7 @@ struct Blob {
     id: usize,
 }
 
-/// Draws a shot exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
+/// Renders a shot exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
 ///
 /// Shapes as in [`super::Renderer::render`]. Panics: `extra` has not one row a splat.
 pub fn render<F: Real>(shot: &Shot<'_, F>, config: &RenderConfig) -> Image<f64> {
@@ -167,7 +167,7 @@ fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usi
     }
 }
 
-/// Channels of a splat that a head sees in addition to its colour.
+/// Channels of a splat that a head reads in addition to its colour.
 fn further<F: Real>(part: &Part<'_, F>, j: usize) -> [f64; FURTHER] {
     match part.color {
         Color::Direct { table } if table.width() == FEATURES => table.read::<FURTHER>(j, BASE).map(F::f64),
@@ -204,8 +204,8 @@ pub struct Oracle {
 }
 
 impl Backend<f64> for Oracle {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.backward || wanted.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        if abilities.backward || abilities.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
@@ -220,7 +220,7 @@ impl Backend<f64> for Oracle {
         _: &mut [Option<&mut Table<f64>>],
         _: &mut RenderGrads<f64>,
     ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..Wanted::default() })
+        self.can(&Abilities { backward: true, ..Abilities::default() })
     }
 
     fn radii(&self) -> &[f64] {

@@ -7,7 +7,7 @@ pub(super) trait Split: Sized + Send {
     fn split(self, items: usize, groups: usize) -> (Self, Self);
 }
 
-/// As many items a group as the starts say.
+/// As many items per group as the starts specify.
 pub(super) struct Ragged<'a, T>(pub &'a mut [T]);
 
 /// The same number of items for every group.

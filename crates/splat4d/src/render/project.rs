@@ -113,7 +113,7 @@ pub struct View<F = f32> {
 }
 
 impl<F: Real> View<F> {
-    /// Of `camera` (drawn as a pinhole) under `config`.
+    /// Of `camera` (rendered as a pinhole) under `config`.
     pub fn new(camera: &Camera, config: &RenderConfig) -> Self {
         let k = &camera.intrinsics;
         let pose = &camera.cam_from_world;
@@ -261,7 +261,8 @@ pub(crate) struct GaussianGrads<F> {
     pub cov: [F; 6],
     /// To the opacity before compensation.
     pub opacity: F,
-    /// To a left perturbation of cam_from_world: translation, rotation; then to the logarithm of the focal lengths, both at once.
+    /// To a left perturbation of cam_from_world: translation, rotation; then to the logarithm of the focal lengths,
+    /// both at once.
     pub camera: [F; CAMERA],
 }
 
@@ -318,8 +319,8 @@ pub(crate) fn project_backward<F: Real>(
     // J = f/z (1, −clamped) in its two rows; the mean's path comes on top.
     let iz = e.inv_z;
     let mut d_p = [F::ZERO, F::ZERO, d.depth];
-    // Longer focal lengths move the centre away from the principal point and stretch M; where J is clamped, its bound is so
-    // many pixels, and its column of z stays.
+    // Longer focal lengths move the centre away from the principal point and stretch M; where J is clamped, its bound
+    // is this many pixels, and its column of z stays.
     let mut d_focal = F::ZERO;
     for a in 0..2 {
         let f = view.focal[a];

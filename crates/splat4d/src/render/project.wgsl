@@ -1,10 +1,10 @@
 // From a Gaussian in the world to an ellipse on the screen (EWA splatting). Twin of render/project.rs, where the
-// equations and their sources stand; CPU and GPU differ only by rounding.
+// equations and their sources are documented; CPU and GPU differ only by rounding.
 //
 // No bindings and no entry point: plain functions, put in front of whatever shader calls them, here and in the player.
 // A thread owns one Gaussian. Guards look at bits, not at values, because a driver may assume that no NaN occurs.
 
-// x/z and y/z inside J may leave the picture by this share of its half-width's tangent (Inria, gsplat).
+// x/z and y/z inside J may leave the image by this share of its half-width's tangent (Inria, gsplat).
 const PROJECT_J_MARGIN: f32 = 0.3;
 // Least compensation of the antialiased mode (gsplat).
 const PROJECT_RHO_MIN: f32 = 0.005;
@@ -15,7 +15,7 @@ const PROJECT_TINY_NORM: f32 = 1e-12;
 // Bit of View.flags: opacity is dimmed for the low-pass (Mip-Splatting, gsplat).
 const VIEW_ANTIALIAS: u32 = 1u;
 
-// A camera and what the renderer was told; 128 bytes, made for a uniform buffer.
+// A camera and the renderer's settings; 128 bytes, made for a uniform buffer.
 struct View {
     camera_from_world: mat4x4<f32>, // columns; the last row is 0 0 0 1; axes x right, y down, z forward
     focal: vec2<f32>,               // px
@@ -24,7 +24,7 @@ struct View {
     near: f32,                      // Gaussians with z <= near are culled, scene units
     low_pass: f32,                  // added to the screen covariance, px^2
     camera: vec3<f32>,              // the camera's centre in the world
-    alpha_min: f32,                 // alpha below this is not drawn; above 0
+    alpha_min: f32,                 // alpha below this is not rendered; above 0
     sh_degree: u32,
     count: u32,                     // Gaussians
     time: f32,
@@ -119,7 +119,7 @@ struct Linear {
 fn linear(view: View, p: vec3<f32>) -> Linear {
     let inv_z = 1.0 / p.z;
     let uv = p.xy * inv_z;
-    // J clamps the direction, so that a Gaussian far outside the picture does not become a huge streak.
+    // J clamps the direction, so that a Gaussian far outside the image does not become a huge streak.
     let margin = PROJECT_J_MARGIN * 0.5 * view.size / view.focal;
     let low = -(view.center / view.focal + margin);
     let high = (view.size - view.center) / view.focal + margin;

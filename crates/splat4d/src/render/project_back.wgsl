@@ -1,7 +1,9 @@
-// From the gradient of an ellipse on the screen to that of its Gaussian and of the camera's pose. Twin of project_backward
-// in render/project.rs, where the equations and their sources stand. render/project.wgsl is put in front of this file.
+// From the gradient of an ellipse on the screen to that of its Gaussian and of the camera's pose. Twin of
+// project_backward in render/project.rs, which documents the equations and their sources. render/project.wgsl is put in
+// front of this file.
 //
-// No bindings and no entry point: plain functions, put in front of whatever shader calls them. A thread owns one Gaussian.
+// No bindings and no entry point: plain functions, put in front of whatever shader calls them. A thread owns one
+// Gaussian.
 
 // Radius in standard deviations that is reported (Inria).
 const RADIUS_SIGMAS: f32 = 3.0;
@@ -17,7 +19,7 @@ struct ScreenGrads {
 // Gradient to one Gaussian, and to a left perturbation of the pose.
 struct GaussianGrads {
     mean: vec3<f32>,
-    cov: Cov,     // an off-diagonal stands for both its places
+    cov: Cov,     // an off-diagonal represents both its entries
     opacity: f32, // before the compensation
     moved: vec3<f32>,
     turned: vec3<f32>,

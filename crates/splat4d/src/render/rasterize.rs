@@ -38,7 +38,7 @@ pub struct Pass<'a, F = f32> {
     pub footprints: &'a [Footprint],
     /// Blended.
     pub channels: &'a [[F; CHANNELS]],
-    /// Behind all splats; [`Raster::blend`] does not look at it.
+    /// Behind all splats; [`Raster::blend`] does not read it.
     pub background: [F; CHANNELS],
     /// Limits of the blend.
     pub config: &'a RenderConfig,
@@ -90,7 +90,7 @@ impl<F: Real> Raster<F> {
         self.gather(projected);
     }
 
-    /// Sees to it that lists and records are those of run `run`.
+    /// Ensures that lists and records are those of run `run`.
     pub(super) fn hold(&mut self, projected: &[Projected<F>], footprints: &[Footprint], run: usize) {
         if self.bins.current != run {
             self.bins.fill(footprints, run);
@@ -184,7 +184,8 @@ impl<F: Real> Raster<F> {
         }
     }
 
-    /// VJP of the last [`Raster::blend`], which must have been of the same pass. Returns the gradient to the background.
+    /// VJP of the last [`Raster::blend`], which must have been of the same pass. Returns the gradient to the
+    /// background.
     pub fn backward(
         &mut self,
         pass: &Pass<'_, F>,

@@ -11,22 +11,24 @@ pub const KEPT: usize = 5;
 /// How the rows of a layer move.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Moves {
-    /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without rotation: not at all.
+    /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without
+    /// rotation: not at all.
     Along {
         /// Order of the polynomial.
         order: usize,
         /// Whether quaternions have a rate.
         rotation: bool,
-        /// Whether the life's centre learns from opacity alone.
+        /// Whether the lifespan's centre learns from opacity alone.
         detach: bool,
-        /// Origin of time for Gaussians that live for ever, seconds.
+        /// Origin of time for Gaussians that have infinite lifespans, seconds.
         origin: f64,
     },
     /// Not at all: positions and quaternions are those of a tracked frame, in a table of their own.
     Posed,
-    /// As slices of Gaussians of space and time ([`motion::native4d`](crate::motion::native4d)), whose further columns are a table.
+    /// As slices of Gaussians of space and time ([`motion::native4d`](crate::motion::native4d)), whose further columns
+    /// are a table.
     Sliced {
-        /// κ, scene units a second.
+        /// κ, scene units per second.
         speed: f64,
         /// Least c, scene units².
         floor: f64,
@@ -46,14 +48,14 @@ impl Moves {
     }
 }
 
-/// A table on the CPU, as [`Table::data`](crate::scene::Table::data) has it; nothing where a layer has no such table.
+/// A table on the CPU, as [`Table::data`](crate::scene::Table::data) stores it; empty where a layer has no such table.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ResidentTable<'a> {
     /// Columns.
     pub width: usize,
     /// Its numbers.
     pub params: &'a [f32],
-    /// First and second moments and step counts, 2·width + 1 columns; nothing where it has not learnt.
+    /// First and second moments and step counts, 2·width + 1 columns; empty where it has not learnt.
     pub moments: &'a [f32],
 }
 
@@ -64,18 +66,19 @@ pub struct ResidentLayer<'a> {
     pub rows: usize,
     /// How they move.
     pub moves: Moves,
-    /// How they live.
+    /// Their lifespans.
     pub life: LifeKind,
     /// See [`KEPT`].
     pub tables: [ResidentTable<'a>; KEPT],
-    /// Sum of |dL/dmean2d|, number of views that drew it, largest radius: three columns.
+    /// Sum of |dL/dmean2d|, number of views that rendered it, largest radius: three columns.
     pub stats: &'a [f32],
-    /// What the poses of a [`Moves::Posed`] layer are held by.
+    /// Ties of the poses of a [`Moves::Posed`] layer.
     pub ties: Option<&'a ResidentTies>,
 }
 
-/// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its points, and a
-/// background that stays where the geometry's own poses are. Weights are those of a point's or an edge's share in the loss.
+/// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its
+/// points, and a background that stays where the geometry's own poses are. Weights are those of a point's or an edge's
+/// share in the loss.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentTies {
     /// Rows of the graph's points.
@@ -139,13 +142,13 @@ pub struct ResidentNoise {
 pub struct ResidentCameras<'a> {
     /// Cameras.
     pub count: usize,
-    /// A table of twelve columns a camera: its matrix without the identity, row by row, then an offset a channel.
+    /// A table of twelve columns per camera: its matrix without the identity, row by row, then an offset per channel.
     pub table: ResidentTable<'a>,
     /// Those whose mean is held at the identity.
     pub held: &'a [usize],
 }
 
-/// What one table learns by.
+/// Learning rule of one table.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentRule {
     /// A rate a column; 0: frozen.
@@ -163,7 +166,7 @@ pub struct ResidentView<'a> {
     pub t: Time,
     /// Colour behind the scene.
     pub background: [f32; 3],
-    /// What it is compared with; a response depends on the camera's number alone.
+    /// Its comparison; a response depends on the camera's number alone.
     pub target: Target<'a>,
     /// Number of the camera, where their colour matrices are kept.
     pub rig: usize,
@@ -199,7 +202,7 @@ pub struct ResidentStepped {
     pub bad: Option<[usize; 3]>,
 }
 
-/// The numbers of a layer, as [`ResidentLayer`] has them.
+/// The numbers of a layer, as in [`ResidentLayer`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentNumbers {
     /// Of the tables.
@@ -210,13 +213,13 @@ pub struct ResidentNumbers {
     pub stats: Vec<f32>,
 }
 
-/// Keeps a scene's tables and takes steps on them: evaluate, draw, compare, back, Adam.
+/// Keeps a scene's tables and takes steps on them: evaluate, render, compare, backward, Adam.
 ///
-/// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does not depend on
-/// when it is read.
+/// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do not depend
+/// on the time of reading.
 pub trait Resident {
-    /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1 − β₁ⁿ) and
-    /// 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
+    /// Takes over all layers, in place of whatever was kept; steps in flight are forgotten. `corrections`: Adam's 1/(1
+    /// − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
     ///
     /// Errors: they are too large for the device, or it failed.
     fn keep(
@@ -226,9 +229,8 @@ pub trait Resident {
         corrections: &[[f32; 2]],
     ) -> Result<()>;
 
-    /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in
-    /// one piece, or no
-    /// pixel of it counts, and nothing was begun.
+    /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in one
+    /// buffer, or no pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>>;
@@ -241,9 +243,10 @@ pub trait Resident {
         Vec::new()
     }
 
-    /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
+    /// The numbers of a layer, with no step in flight. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers>;
 
-    /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of `fetch`.
+    /// The cameras' colour matrices and their moments, in the same way; empty where none are kept. Errors: as of
+    /// `fetch`.
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]>;
 }

@@ -44,7 +44,7 @@ pub fn blend(simd: Simd) -> f64 {
     variants.into_iter().fold(0.0, f64::max)
 }
 
-/// Bytes a second between memory and the threads of the current rayon pool: a = b + s·c, counted as STREAM does
+/// Bytes per second between memory and the threads of the current rayon pool: a = b + s·c, counted as STREAM does
 /// (McCalpin 1995), without the reads that a cache makes before it writes.
 pub fn bandwidth() -> f64 {
     let (mut a, mut b, mut c) = (vec![0.0f32; NUMBERS], vec![0.0f32; NUMBERS], vec![0.0f32; NUMBERS]);
@@ -77,7 +77,7 @@ fn speed<const LANES: usize, const ROWS: usize>(simd: Simd) -> f64 {
     (SPLATS * LANES * ROWS) as f64 / best
 }
 
-/// The splat that passes the pixels again and again, each time a little lower; one number a lane, as a register has it.
+/// The splat that passes the pixels again and again, each time a little lower; one number per lane.
 #[repr(C, align(64))]
 struct Splat<const LANES: usize> {
     /// Exponent at a pixel: ax + q·dy.

@@ -1,8 +1,8 @@
 //! The colour of every visible splat: spherical harmonics along the viewing direction, or a colour given directly.
 //!
 //! Works on the splats of one block of the SH table at once, so that coefficients are read as whole vectors: sixteen
-//! where all rows are drawn, those that are alive elsewhere. The block's columns are in as many cache lines as one row
-//! does, so that nothing is read for the others' sake.
+//! where all rows are rendered, those that are alive elsewhere. The block's columns are in as many cache lines as one
+//! row does, so that nothing is read for the others' sake.
 
 use super::gather::CHANNELS;
 use super::project::{CHUNK_ROWS, Lanes, Projected, Projection};
@@ -22,7 +22,7 @@ fn color_width<'a, F: Real>(part: &Part<'a, F>) -> Option<&'a Table<F>> {
     }
 }
 
-/// SH columns of a part: blocks of `block` columns each, of which `used` coefficients a channel are drawn.
+/// SH columns of a part: blocks of `block` columns each, of which `used` coefficients a channel are rendered.
 #[derive(Clone, Copy, Debug)]
 struct Layout {
     blocks: usize,
@@ -222,8 +222,8 @@ impl<F: Real> Kernel for Forward<'_, F> {
 
 /// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
-/// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
-/// taken as they are, columns beyond the third are not drawn. The direction of view is taken to the axes of each part's SH.
+/// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are taken as they
+/// are, columns beyond the third are not rendered. The direction of view is taken to the axes of each part's SH.
 pub fn forward<F: Real>(projection: &Projection<'_, F>, degree: usize, channels: &mut [[F; CHANNELS]]) {
     let Projection { splats, view, simd, projected } = *projection;
     let (mut first, mut rest) = (0, channels);
@@ -378,7 +378,7 @@ struct DirectionGrads<'a, F> {
     weights: Option<&'a Table<F>>,
     layout: Layout,
     center: [F; 3],
-    /// The task's splats; the others' numbers are at hand as well.
+    /// The task's splats; the others' numbers are available as well.
     splats: Range<usize>,
     projected: &'a [Projected<F>],
     channels: &'a [[F; CHANNELS]],

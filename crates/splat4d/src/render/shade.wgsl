@@ -49,7 +49,7 @@ fn sh_basis(dir: vec3<f32>) -> array<f32, 16> {
     );
 }
 
-// Coefficients a channel that are drawn of a table that holds `held` of them, when `degree` is asked for.
+// Coefficients a channel that are rendered of a table that holds `held` of them, when `degree` is requested.
 fn sh_used(held: u32, degree: u32) -> u32 {
     let asked = (degree + 1u) * (degree + 1u);
     if (held >= 16u) { return min(asked, 16u); }

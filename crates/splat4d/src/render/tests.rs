@@ -19,8 +19,8 @@ const THRESHOLD_SHARE: f64 = 2e-3;
 /// A rotation: the axes of the foreign SH.
 const AXES: [[f64; 3]; 3] = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]];
 
-/// Three layers: the layer's own SH through a row list, foreign SH of two weighted blocks in axes of their own, and direct
-/// colours.
+/// Three layers: the layer's own SH through a row list, foreign SH of two weighted blocks in axes of their own, and
+/// direct colours.
 #[derive(Clone)]
 struct Scene<F> {
     outs: [Table<F>; 3],
@@ -486,8 +486,8 @@ fn no_gradient_passes_a_ceiling() {
 }
 
 #[test]
-fn tight_boxes_cover_what_a_three_sigma_circle_covers() {
-    // At 3.3σ an opaque splat still has α = .0043 > 1/255: it must be drawn there.
+fn tight_boxes_cover_a_three_sigma_circle() {
+    // At 3.3σ an opaque splat still has α = .0043 > 1/255: it must be rendered there.
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 0.04, 1.0)]);
     let view = frontal(101, 100.0);
     let mut image = Image::default();
@@ -578,7 +578,7 @@ fn instruction_levels_agree() {
 fn contributions_are_the_oracles_and_sum_to_alpha() {
     let mut s = scene(8, 50, 0.1);
     let n = s.splats().len();
-    // A channel of its own for every splat, white there alone: the oracle's images of these channels are the answer.
+    // A channel of its own for every splat, white there alone: the oracle's images of these channels are the result.
     s.extra = Table::new(&[("own", n)], n);
     (0..n).for_each(|j| s.extra.set(j, j, 1.0));
     let view = camera(75, 41);
@@ -629,11 +629,11 @@ fn contributions_change_no_gradient_and_do_not_depend_on_threads() {
     assert_eq!(one.1, run(false).1);
 }
 
-/// A splat's removal is drawn: the same splats with its opacity at 0.
+/// A splat's removal is rendered: the same splats with its opacity at 0.
 #[test]
-fn removals_are_what_an_image_loses_with_each_splat() {
+fn removals_equal_the_loss_of_an_image_without_each_splat() {
     let mut s = scene(12, 12, 0.15);
-    // No pixel stops early, since one that has would go on without the splat.
+    // No pixel stops early, since one that has would continue without the splat.
     s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
     let view = camera(75, 41);
     let whole = draw_oracle(&s, &view, complete());
@@ -663,7 +663,7 @@ fn sensitivities_are_sums_of_squared_differences() {
     let view = camera(45, 31);
     // Colours that do not depend on the direction, and no thresholds.
     let config = smooth();
-    // A bare bell's tail counts as its middle does, as far as it is drawn.
+    // A bare bell's tail counts like its middle, where it is rendered.
     let cut = complete();
     let plain = |s: &Scene<f64>, config: &RenderConfig| {
         oracle::render(&Shot { sh_degree: 0, ..Shot::new(&s.splats(), &view, BACKGROUND) }, config).color.data
@@ -731,8 +731,8 @@ fn sensitivities_are_sums_of_squared_differences() {
     assert!(strong > 6, "{strong} splats matter");
 }
 
-/// Precision of f32 in the backward pass: behind many opaque splats, what is still to come is a small difference of
-/// large sums.
+/// Precision of f32 in the backward pass: behind many opaque splats, the remaining light is a small difference of large
+/// sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
     let mut s = scene(9, 150, 0.12);

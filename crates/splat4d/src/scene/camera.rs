@@ -15,7 +15,7 @@ pub struct Intrinsics {
     pub cy: f64,
 }
 
-/// How the lens bends rays. The renderer draws pinhole images; captures are undistorted on load.
+/// How the lens bends rays. The renderer renders pinhole images; captures are undistorted on load.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Lens {
@@ -155,12 +155,12 @@ pub struct Camera {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Splats with z ≤ near are not drawn, scene units.
+    /// Splats with z ≤ near are not rendered, scene units.
     pub near: f64,
 }
 
 impl Camera {
-    /// Where nothing else is known, splats nearer than this are not drawn (as gsplat).
+    /// Where nothing else is known, splats nearer than this are not rendered (as gsplat).
     pub const NEAR: f64 = 0.01;
 
     /// A pinhole camera with square pixels, its principal point in the middle. `fov_y` in radians.

@@ -1,6 +1,5 @@
-//! Feature channels: numbers of a Gaussian that images of features have taught it (what a network sees in an image,
-//! or any
-//! other numbers a pixel), in a table of the layer that follows every edit of rows.
+//! Feature channels: numbers per Gaussian learnt from images of features (outputs of a network on an image, or any
+//! other numbers per pixel), in a table of the layer that follows every edit of rows.
 
 use super::{Key, Params, Space, Table};
 use crate::Result;

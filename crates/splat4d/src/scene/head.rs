@@ -1,6 +1,6 @@
 //! The feature head: a tiny network that turns nine blended channels of a pixel into its colour.
 //!
-//! Here are its weights and their shapes; what it computes, and how that is drawn, stands in `render/head.rs`.
+//! This file defines its weights and their shapes; its function and rendering are in `render/head.rs`.
 //! Source: Li et al. 2024 (Spacetime Gaussians) §4.1 and its released code.
 
 use super::{Key, Params};
@@ -13,7 +13,7 @@ pub(crate) const FEATURES: usize = BASE + FURTHER;
 pub(crate) const BASE: usize = 3;
 /// Those of them that are blended next to the base colour.
 pub const FURTHER: usize = 6;
-/// Numbers that the network sees of a pixel: its further channels, its ray's origin and direction.
+/// Inputs of the network per pixel: its further channels, its ray's origin and direction.
 pub const INPUTS: usize = FURTHER + 6;
 /// Width of the network's hidden layer.
 pub(crate) const HIDDEN: usize = 6;
@@ -22,7 +22,7 @@ pub const HEAD_IN: &str = "head.in";
 /// Name of the table of W₂, 3 x `HIDDEN`, row-major, one column.
 pub const HEAD_OUT: &str = "head.out";
 
-/// Where the weights of a head are: two `Fixed` tables in the parameters of a layer.
+/// Location of a head's weights: two `Fixed` tables in the parameters of a layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HeadKeys {
     /// W₁
@@ -32,8 +32,8 @@ pub struct HeadKeys {
 }
 
 impl HeadKeys {
-    /// Makes the weights, or claims the loaded ones: W₁ uniform within ±√(6/[`INPUTS`]) (He et al. 2015), W₂ zero, so that
-    /// the head starts as the identity. Errors: loaded arrays of the wrong shape.
+    /// Makes the weights, or claims the loaded ones: W₁ uniform within ±√(6/[`INPUTS`]) (He et al. 2015), W₂ zero, so
+    /// that the head starts as the identity. Errors: loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(seed: u64, p: &mut Params<F>) -> Result<Self> {
         let bound = (6.0 / INPUTS as f64).sqrt();
         let rng = Rng::new(seed, HEAD_IN, 0);

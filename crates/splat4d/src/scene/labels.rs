@@ -1,5 +1,5 @@
-//! Labels: what a Gaussian is part of, as a logit for each of a scene's labels, in a table of the layer that follows every
-//! edit of rows.
+//! Labels: what a Gaussian is part of, as a logit for each of a scene's labels, in a table of the layer that follows
+//! every edit of rows.
 //!
 //! A Gaussian's probabilities are the softmax of its logits; images blend probabilities, not logits (Siddiqui et al.
 //! 2023,
@@ -15,7 +15,7 @@ pub(crate) const LABELS: &str = "labels";
 pub const LABEL_LOGITS: &str = "label_logits";
 /// Most labels of a scene: what a byte can number, without the code of no label.
 pub const MOST_LABELS: usize = 255;
-/// Logit of the label of a Gaussian that is known to have it; the others are 0.
+/// Logit of the label of a Gaussian whose label is certain; the others are 0.
 const SURE: f64 = 10.0;
 
 /// Adds the table of `count` labels, filled from what was loaded, else with zeros: every label is as likely.
@@ -100,7 +100,7 @@ pub fn named(names: &[String], name: &str) -> Result<usize> {
     })
 }
 
-/// Errors: no names, too many, an empty one, or one twice.
+/// Errors: no names, too many, an empty one, or a duplicate.
 pub fn check(names: &[String]) -> Result<()> {
     if names.is_empty() || names.len() > MOST_LABELS {
         return Err(Error::input(format!("{} labels", names.len()))
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn stated_labels_come_back_and_names_are_checked() {
+    fn stated_labels_round_trip_and_names_are_checked() {
         let mut params = Params::<f32>::new(3, 1, &[]);
         state(&mut params, 2, &[Some(1), None, Some(0)]);
         assert_eq!(of(&params), [Some(1), None, Some(0)]);

@@ -1,5 +1,5 @@
-//! The life of a Gaussian: an envelope in time that any layer may carry, so that birth, death and the active set work for
-//! every motion model.
+//! The lifespan of a Gaussian: an envelope in time that any layer may carry, so that birth, death and the active set
+//! work for every motion model.
 
 use super::Time;
 use crate::math::Real;
@@ -7,7 +7,7 @@ use crate::math::Real;
 /// The shape of the envelope σ(t) of a layer's Gaussians. Centres and widths are in seconds, widths as logarithms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LifeKind {
-    /// σ = 1 for ever; no columns.
+    /// σ = 1 at all times; no columns.
     Infinite,
     /// σ = exp(−½u²), u = (t − centre)/width: FreeTimeGS (Wang et al. 2025) and native 4D Gaussians.
     GaussHalf,
@@ -17,11 +17,11 @@ pub enum LifeKind {
     Interval,
 }
 
-/// Column of the centre in the life table.
+/// Column of the centre in the lifespan table.
 pub const CENTER: usize = 0;
-/// Column of the logarithm of the width in the life table.
+/// Column of the logarithm of the width in the lifespan table.
 pub const LOG_WIDTH: usize = 1;
-/// Column of the logarithm of the softness in the life table (interval only).
+/// Column of the logarithm of the softness in the lifespan table (interval only).
 pub(crate) const LOG_SOFTNESS: usize = 2;
 
 /// σ and its derivatives to (t, centre, log width, log softness).
@@ -38,7 +38,7 @@ pub struct LifeValue<F> {
 }
 
 impl LifeKind {
-    /// The life table's columns.
+    /// The lifespan table's columns.
     pub fn columns(self) -> &'static [(&'static str, usize)] {
         match self {
             Self::Infinite => &[],
@@ -62,7 +62,7 @@ impl LifeKind {
         [Self::Infinite, Self::GaussHalf, Self::GaussOne, Self::Interval].into_iter().find(|k| k.name() == name)
     }
 
-    /// σ at time t and its derivatives; `row` holds the life columns (unused ones are not read).
+    /// σ at time t and its derivatives; `row` holds the lifespan columns (unused ones are not read).
     #[inline(always)]
     pub fn eval<F: Real>(self, row: [F; 3], t: Time) -> LifeValue<F> {
         let zero = F::ZERO;
@@ -93,8 +93,8 @@ impl LifeKind {
         }
     }
 
-    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the life
-    /// is. Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
+    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the
+    /// lifespan is. Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
     pub fn d2_time<F: Real>(self, row: [F; 3], t: Time) -> F {
         let (delta, sigma) = (F::of(t.0) - row[CENTER], self.eval(row, t).sigma);
         // σ = exp(−h·x²), x in units of 1/inverse: σ'' = (4h²x² − 2h)·σ·inverse².
@@ -116,7 +116,8 @@ impl LifeKind {
         (h2 * h2 * x * x - h2) * sigma * inverse * inverse
     }
 
-    /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches it.
+    /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches
+    /// it.
     pub fn reach(self, row: [f64; 3], opacity: f64, alpha_min: f64) -> f64 {
         let level = (opacity / alpha_min).ln();
         if level < 0.0 {
@@ -131,7 +132,7 @@ impl LifeKind {
     }
 }
 
-/// Exact interval buckets over a clip: the rows alive at t without a look at the others.
+/// Exact interval buckets over a clip: the rows alive at t without examining the others.
 #[derive(Clone, Debug, Default)]
 pub struct LifeBuckets {
     start: f64,
@@ -142,7 +143,7 @@ pub struct LifeBuckets {
 
 impl LifeBuckets {
     /// Sorts rows with the given spans [from, to] (seconds; from > to: never alive) into `count` buckets over the clip.
-    /// Times outside the clip look into the first or last bucket, which also hold everything beyond.
+    /// Times outside the clip use the first or last bucket, which also contain everything beyond.
     pub(crate) fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
         let count = count.max(1);
         let width = ((clip[1] - clip[0]) / count as f64).max(f64::MIN_POSITIVE);
@@ -202,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn spacetime_and_freetime_lives_agree_at_width_times_sqrt_two() {
+    fn spacetime_and_freetime_lifespans_agree_at_width_times_sqrt_two() {
         for t in [-0.7, 0.0, 0.2, 1.5] {
             let free = LifeKind::GaussHalf.eval([0.2, -0.5, 0.0], Time(t)).sigma;
             let stg = LifeKind::GaussOne.eval([0.2, -0.5 + 2.0f64.sqrt().ln(), 0.0], Time(t)).sigma;

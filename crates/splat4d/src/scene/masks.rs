@@ -5,8 +5,8 @@ use super::{RowEdit, Space};
 /// Rows of a word.
 pub(crate) const WORD: usize = u32::BITS as usize;
 
-/// A bit a Gaussian and key time. Between two key times a Gaussian is drawn only if its bit is set at one of them; before
-/// the first and after the last, if it is set there.
+/// A bit per Gaussian and key time. Between two key times a Gaussian is rendered only if its bit is set at one of them;
+/// before the first and after the last, if it is set there.
 ///
 /// Masks select Gaussians by importance, lifespans by time: a layer renders those that both admit.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -26,8 +26,8 @@ impl KeyMasks {
         Self { times, rows, words }
     }
 
-    /// From words as [`words`](Self::words) gives them; `None` if their number is wrong or a bit beyond the last row is set.
-    /// Panics as [`new`](Self::new).
+    /// From words as [`words`](Self::words) gives them; `None` if their number is wrong or a bit beyond the last row is
+    /// set. Panics as [`new`](Self::new).
     pub(crate) fn from_words(times: Vec<f64>, rows: usize, words: Vec<u32>) -> Option<Self> {
         let wanted = Self::new(times, rows);
         let stride = wanted.stride();
@@ -69,7 +69,7 @@ impl KeyMasks {
         self.words[place] |= 1 << (row % WORD);
     }
 
-    /// The key times on both sides of t: twice the same one on a key and outside of all.
+    /// The key times on both sides of t: the same one twice on a key and outside the range.
     pub fn keys_at(&self, t: f64) -> [usize; 2] {
         let last = self.times.len() - 1;
         let after = self.times.partition_point(|k| *k < t);
@@ -79,18 +79,18 @@ impl KeyMasks {
         [if self.times[after] == t { after } else { after.saturating_sub(1) }, after]
     }
 
-    /// Whether a row may be drawn at time t.
+    /// Whether a row may be rendered at time t.
     pub fn allows(&self, t: f64, row: usize) -> bool {
         let [l, r] = self.keys_at(t);
         self.get(l, row) || self.get(r, row)
     }
 
-    /// The words of the two keys around t: a row may be drawn where either has its bit.
+    /// The words of the two keys around t: a row may be rendered where either has its bit.
     pub(crate) fn words_at(&self, t: f64) -> [&[u32]; 2] {
         self.keys_at(t).map(|k| &self.words[k * self.stride()..][..self.stride()])
     }
 
-    /// Keeps those of `ids` (rows, in any order) that may be drawn at time t.
+    /// Keeps those of `ids` (rows, in any order) that may be rendered at time t.
     pub(crate) fn retain(&self, t: f64, ids: &mut Vec<u32>) {
         let [l, r] = self.words_at(t);
         ids.retain(|&i| (l[i as usize / WORD] | r[i as usize / WORD]) >> (i as usize % WORD) & 1 == 1);
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn words_come_back_and_damage_is_noticed() {
+    fn mask_words_round_trip_and_damage_is_detected() {
         let m = random(3, 70);
         let again = |words: Vec<u32>| KeyMasks::from_words(m.times().to_vec(), 70, words);
         assert_eq!(again(m.words().to_vec()), Some(m.clone()));

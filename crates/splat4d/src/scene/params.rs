@@ -15,7 +15,7 @@ pub enum Space {
     Nodes,
 }
 
-/// Where a new row came from. All but `Kept` start with zero moments and statistics.
+/// Origin of a new row. All but `Kept` start with zero moments and statistics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Born {
     /// The row itself.
@@ -35,7 +35,7 @@ pub struct RowEdit {
     pub space: Space,
     /// For every new row, the old row it copies.
     pub parent: Vec<u32>,
-    /// For every new row, how it came about.
+    /// The origin of every new row.
     pub born: Vec<Born>,
 }
 
@@ -77,7 +77,7 @@ pub struct Key(pub u32);
 pub const GEOMETRY: Key = Key(0);
 /// `sh` 3·K, coefficient-major: coefficient k of channel c is column 3k + c.
 pub const SH: Key = Key(1);
-/// The life envelope's columns, none for a layer whose Gaussians live for ever.
+/// The lifespan envelope's columns, none for a layer whose Gaussians have infinite lifespans.
 pub const LIFE: Key = Key(2);
 
 /// Columns of [`GEOMETRY`].
@@ -103,14 +103,14 @@ pub struct ParamInfo {
     pub trainable: bool,
 }
 
-/// An array as it came from a file, waiting to be claimed by [`Params::entry`].
+/// An array from a file, to be claimed by [`Params::entry`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoadedArray {
     /// Column group's name.
     pub name: String,
     /// Rows.
     pub rows: usize,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
     /// Row-major.
     pub data: Vec<f32>,
@@ -130,12 +130,14 @@ pub struct Params<F = f32> {
 }
 
 impl<F: Real> Params<F> {
-    /// `rows` Gaussians with `sh_coefficients` (K) spherical-harmonic coefficients and the given life columns, all zero.
+    /// `rows` Gaussians with `sh_coefficients` (K) spherical-harmonic coefficients and the given life columns, all
+    /// zero.
     pub fn new(rows: usize, sh_coefficients: usize, life: &[(&'static str, usize)]) -> Self {
         Self::build(Vec::new(), rows, sh_coefficients, life).expect("without loaded arrays nothing can mismatch")
     }
 
-    /// As [`new`](Self::new), filled from loaded arrays where the names match; the rest waits for [`entry`](Self::entry).
+    /// As [`new`](Self::new), filled from loaded arrays where the names match; the rest waits for
+    /// [`entry`](Self::entry).
     pub fn build(
         loaded: Vec<LoadedArray>,
         rows: usize,
@@ -183,8 +185,8 @@ impl<F: Real> Params<F> {
         Ok(key)
     }
 
-    /// A `Fixed` table of one column of `numbers` rows, which lie one after the other: a weight, a grid. The table and its
-    /// column group share the name.
+    /// A `Fixed` table of one column of `numbers` rows, which are stored contiguously: a weight, a grid. The table and
+    /// its column group share the name.
     ///
     /// Errors: the loaded array has another shape.
     pub fn array(&mut self, name: &str, numbers: usize, init: impl FnOnce(&mut [F])) -> Result<Key> {
@@ -231,7 +233,7 @@ impl<F: Real> Params<F> {
         Ok(Key(self.tables.len() as u32 - 1))
     }
 
-    /// Arrays that came from a file and that no table has claimed.
+    /// Arrays from a file that no table has claimed.
     pub(crate) fn unclaimed(&self) -> &[LoadedArray] {
         &self.loaded
     }
@@ -256,7 +258,7 @@ impl<F: Real> Params<F> {
         &mut self.infos[key.0 as usize]
     }
 
-    /// Several tables to write at once. Panics: a key stands twice.
+    /// Several tables to write at once. Panics: a key occurs twice.
     pub fn get_mut<const N: usize>(&mut self, keys: [Key; N]) -> [&mut Table<F>; N] {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
@@ -286,7 +288,7 @@ impl<F: Real> Params<F> {
         *own = table;
     }
 
-    /// Gathers every table of the edit's space. Models mend what copying alone cannot in `Motion::on_edit`.
+    /// Gathers every table of the edit's space. Models correct what copying alone cannot in `Motion::on_edit`.
     pub fn apply(&mut self, edit: &RowEdit) {
         for (info, table) in self.infos.iter().zip(&mut self.tables) {
             if info.space == edit.space {
@@ -337,8 +339,8 @@ impl<F> std::ops::IndexMut<Key> for Params<F> {
 
 /// Gradients to a [`Params`]. Only touched tables and active rows are ever cleared or stepped.
 ///
-/// Pages of frames that nothing reaches cost nothing: their tables have no rows until something is added to them, so that
-/// memory does not grow with the frames that were tracked before.
+/// Pages of frames that nothing reaches cost nothing: their tables have no rows until something is added to them, so
+/// that memory does not grow with the frames that were tracked before.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Grads<F = f32> {
     tables: Vec<Table<F>>,
@@ -365,7 +367,7 @@ impl<F: Real> Grads<F> {
         }
     }
 
-    /// Several tables to add to at once; marks them touched. Panics: a key stands twice.
+    /// Several tables to add to at once; marks them touched. Panics: a key occurs twice.
     pub fn of<const N: usize>(&mut self, keys: [Key; N]) -> [&mut Table<F>; N] {
         for k in keys.map(|k| k.0 as usize) {
             self.touched[k] = true;
@@ -376,7 +378,7 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
-    /// As [`of`](Self::of) for a number of keys that only the model's sizes give. Panics: a key stands twice.
+    /// As [`of`](Self::of) for a number of keys that depends on the model's sizes. Panics: a key occurs twice.
     pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
         let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();
         for (i, table) in self.tables.iter_mut().enumerate() {
@@ -471,7 +473,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn entry_claims_loaded_arrays_and_names_what_is_wrong() {
+    fn entry_claims_loaded_arrays_and_names_the_error() {
         let array =
             |name: &str, rows, width| LoadedArray { name: name.into(), rows, width, data: vec![1.0; rows * width] };
         let mut p = Params::<f32>::build(vec![array("v", 2, 3)], 2, 1, &[]).unwrap();
@@ -499,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn clear_resets_what_was_touched() {
+    fn clear_resets_changed_entries() {
         let p = Params::<f32>::new(20, 1, &[]);
         let mut g = Grads::new(&p);
         g.activate(Space::Gaussians, crate::scene::Rows::Some(&[3, 17]));

@@ -1,4 +1,4 @@
-//! [`Splats`]: the scene at one time, activated: all the renderer ever sees.
+//! [`Splats`]: the scene at one time, activated: the renderer's input.
 
 use super::head::HeadWeights;
 use super::rows::Rows;
@@ -12,7 +12,7 @@ pub const COV: usize = 3;
 /// Column of the opacity in [`Part::out`].
 pub const SPLAT_OPACITY: usize = 9;
 
-/// Where a part's colour comes from.
+/// Source of a part's colour.
 #[derive(Clone, Copy, Debug)]
 pub enum Color<'a, F = f32> {
     /// Spherical harmonics, borrowed from the parameters: splat j has row `rows.id(j)`.
@@ -23,7 +23,7 @@ pub enum Color<'a, F = f32> {
         rows: Rows<'a>,
         /// Optional weights [splats, blocks] of blocks of coefficients (time-dependent SH).
         weights: Option<&'a Table<F>>,
-        /// Whether the table is the layer's own SH, whose gradient goes straight to `Grads`.
+        /// Whether the table is the layer's own SH, whose gradient is added directly to `Grads`.
         base: bool,
     },
     /// One colour a splat.
@@ -41,7 +41,8 @@ pub struct Part<'a, F = f32> {
     pub out: &'a Table<F>,
     /// Colour.
     pub color: Color<'a, F>,
-    /// Rotation (rows) that takes directions of the world to the axes of the spherical harmonics; none: they are the same.
+    /// Rotation (rows) that takes directions of the world to the axes of the spherical harmonics; none: they are the
+    /// same.
     pub layer_from_world: Option<[[F; 3]; 3]>,
 }
 
@@ -55,7 +56,7 @@ impl<'a, F: Real> Part<'a, F> {
 /// A scene at one time: a part a layer. Splats are numbered through all parts in order.
 #[derive(Clone, Debug, Default)]
 pub struct Splats<'a, F = f32> {
-    /// One a layer.
+    /// One per layer.
     pub parts: Vec<Part<'a, F>>,
     /// Network from blended channels to colour; none: they are the colour. To it, parts without features have zeros.
     pub head: Option<HeadWeights<'a, F>>,

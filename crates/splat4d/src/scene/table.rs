@@ -1,4 +1,4 @@
-//! [`Table`]: everything that has a row per Gaussian (or per node, or one row for ever) lives in one of these.
+//! [`Table`]: the container of everything with a row per Gaussian, per node, or a single row.
 //!
 //! Rows are stored in blocks `[row/16][column][16]`: a block is one AVX-512 register (or two AVX2 ones) a column, and a
 //! range of rows is one slice. A table of one column is therefore contiguous, so that a matrix product can read it.
@@ -15,7 +15,7 @@ pub const BLOCK: usize = 16;
 pub struct Column {
     /// The array's name in a scene file.
     pub name: Cow<'static, str>,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
 }
 
@@ -51,7 +51,7 @@ impl<F: Real> Table<F> {
         self.rows
     }
 
-    /// Numbers a row.
+    /// Numbers per row.
     pub fn width(&self) -> usize {
         self.width
     }
@@ -250,7 +250,7 @@ pub struct TableMut<'a, F = f32> {
     pub first: usize,
     /// Rows in the view.
     pub rows: usize,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
     /// `[row/16][column][16]`
     pub data: &'a mut [F],
@@ -262,7 +262,7 @@ impl<F> TableMut<'_, F> {
         self.rows.div_ceil(BLOCK)
     }
 
-    /// The first `blocks` blocks, and the rest. Panics: there are not so many.
+    /// The first `blocks` blocks, and the rest. Panics: there are not this many.
     pub(crate) fn split_at(self, blocks: usize) -> (Self, Self) {
         let rows = (blocks * BLOCK).min(self.rows);
         let (head, tail) = self.data.split_at_mut(blocks * BLOCK * self.width);

@@ -1,5 +1,5 @@
-//! What every motion model must keep, checked on a model made from its [`Spec`] with random parameters in f64: gradients
-//! to every table and to t against central differences, compact rows, random access, files, row edits.
+//! What every motion model must keep, checked on a model made from its [`Spec`] with random parameters in f64:
+//! gradients to every table and to t against central differences, compact rows, random access, files, row edits.
 
 use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
 use splat4d::layers::{Head, Layer, Scene};
@@ -18,7 +18,7 @@ const H: f64 = 1e-6;
 const TOLERANCE: (f64, f64) = (2e-5, 1e-7);
 /// Numbers of every table that are moved, at most.
 const PROBED: usize = 40;
-/// The times that are asked: within the clip of one second, on a frame, at its ends and outside.
+/// The times that are queried: within the clip of one second, on a frame, at its ends and outside.
 const TIMES: [f64; 5] = [0.31, 0.7333, 0.0, 1.0, 1.2];
 
 /// A model in f64 with its parameters.
@@ -56,7 +56,7 @@ pub(crate) fn subject(spec: &Spec, rows: usize, life: LifeKind, spread: f64, see
     Subject { p, motion }
 }
 
-/// One scalar of everything a model answers, and its gradient: random weights on splats, colours and SH weights.
+/// One scalar of all results of a model, and its gradient: random weights on splats, colours and SH weights.
 struct Weights(Rng);
 
 impl Weights {
@@ -84,12 +84,12 @@ impl Subject {
         (cache, tape)
     }
 
-    /// The splats of a question.
+    /// The splats of a query.
     pub(crate) fn splats(&self, of: Space, rows: Rows<'_>, t: f64) -> Table<f64> {
         self.request(of, rows, t).1.out
     }
 
-    fn questions<'a>(&'a self, spaces: &[Space], rows: &'a [u32], times: &[f64]) -> Vec<At<'a, f64>> {
+    fn queries<'a>(&'a self, spaces: &[Space], rows: &'a [u32], times: &[f64]) -> Vec<At<'a, f64>> {
         let mut out = Vec::new();
         for &of in spaces {
             for (k, &t) in times.iter().enumerate() {
@@ -100,9 +100,9 @@ impl Subject {
         out
     }
 
-    /// Σ weights · answers over all questions of a step.
+    /// Σ weights · results over all queries of a step.
     fn value(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> f64 {
-        let q = self.questions(spaces, rows, times);
+        let q = self.queries(spaces, rows, times);
         let mut cache = Cache::default();
         self.motion.prepare(&self.p, &q, &mut cache);
         let mut sum = 0.0;
@@ -120,9 +120,9 @@ impl Subject {
         sum
     }
 
-    /// The gradient of [`value`](Self::value), and to every question's time.
+    /// The gradient of [`value`](Self::value), and to every query's time.
     fn gradient(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> (Grads<f64>, Vec<f64>) {
-        let q = self.questions(spaces, rows, times);
+        let q = self.queries(spaces, rows, times);
         let (mut cache, mut d_cache) = (Cache::default(), Cache::default());
         let mut d = Grads::new(&self.p);
         self.motion.prepare(&self.p, &q, &mut cache);
@@ -195,7 +195,7 @@ impl Subject {
         }
     }
 
-    /// A question about some rows answers as the question about all.
+    /// A query for some rows returns the same as one for all.
     pub(crate) fn compact(&self) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 4 == 1 || r % 7 == 0).collect();
         for t in TIMES {
@@ -212,7 +212,7 @@ impl Subject {
         }
     }
 
-    /// Any time has an answer, alone as together with others.
+    /// Any time has a result, alone as together with others.
     pub(crate) fn random_access(&self) {
         for t in [-1e4, -0.3, 0.0, 0.5, 1.0, 1.7, 1e4] {
             let out = self.splats(Space::Gaussians, Rows::All, t);
@@ -257,7 +257,8 @@ impl Subject {
     }
 }
 
-/// The model is as it states: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
+/// The model agrees with its capabilities: own motion and lifespan, the SH table, scratch, and the polynomial of its
+/// path.
 pub(crate) fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 4);
     let told = s.motion.capabilities();
@@ -331,7 +332,7 @@ pub(crate) fn files(spec: &Spec, rows: usize, life: LifeKind) {
     assert!(*spec == Spec::Still || refused.is_err(), "unknown fields are refused");
 }
 
-/// An answer at the start is the canonical cloud: what `build` makes does not move anything.
+/// A result at the start is the canonical cloud: what `build` makes does not move anything.
 pub(crate) fn starts_still(spec: &Spec, rows: usize) {
     let s = subject(spec, rows, LifeKind::Infinite, 0.0, 9);
     let mut still = Params::<f64>::new(rows, 4, &[]);
@@ -339,7 +340,7 @@ pub(crate) fn starts_still(spec: &Spec, rows: usize) {
     let rest = Subject { p: still, motion: Arc::new(Still) };
     for t in TIMES {
         let (a, b) = (s.splats(Space::Gaussians, Rows::All, t), rest.splats(Space::Gaussians, Rows::All, t));
-        // Numbers past the last row mean nothing, so that blocks are not compared as they are.
+        // Numbers past the last row are undefined, so blocks are not compared directly.
         for (row, col) in (0..rows).flat_map(|row| (0..10).map(move |col| (row, col))) {
             let (a, b) = (a.get(row, col), b.get(row, col));
             assert!((a - b).abs() < 1e-9, "row {row} at {t}: {a}, the canonical cloud has {b}");
@@ -379,12 +380,12 @@ pub(crate) fn any_threads(spec: &Spec, rows: usize) {
 }
 
 /// A filter around the model: switched off it changes nothing; switched on, a step along a random direction of all
-/// learnable numbers changes the answers as the gradient states.
+/// learnable numbers changes the results as the gradient states.
 pub(crate) fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     let plain = subject(spec, rows, life, 0.1, 1);
     let around = |fusion: Fusion| {
         let mut p = plain.p.clone();
-        // The clip begins so early that every question has a past.
+        // The clip begins so early that every query has a past.
         let own = FilteredSpec::around(spec.clone(), 0.05, -1.0);
         let own = FilteredSpec { fusion, stop_gradient: false, ..own };
         let motion = Arc::new(Filtered::around(plain.motion.clone(), own, &mut p).expect("settings are sound"));

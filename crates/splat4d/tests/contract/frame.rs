@@ -1,5 +1,5 @@
 //! A layer's frame, for every motion model: frame then evaluate is evaluate then frame, in numbers and in images; its
-//! gradient; files, frozen moments and baked scenes take it along.
+//! gradient; files, frozen times and baked scenes include it.
 
 use crate::check::subject;
 use splat4d::bake::{Options, Shown, bake, compare};
@@ -11,9 +11,9 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table, Time};
 
-/// Largest difference between a framed answer and the answer framed by hand, and of their images, in f64.
+/// Largest difference between a framed result and the result framed by hand, and of their images, in f64.
 const SAME: f64 = 1e-6;
-/// Largest difference between a frozen moment's image and the scene's: f32, and shapes out of a decomposition.
+/// Largest difference between a frozen time's image and the scene's: f32, and shapes out of a decomposition.
 const FROZEN: f32 = 2e-3;
 /// Likeness of a baked scene and the model from which on images are the same, dB.
 const ALIKE: f64 = 45.0;
@@ -21,7 +21,7 @@ const ALIKE: f64 = 45.0;
 const AS_WELL: f64 = 3.0;
 /// Half the step of the central differences.
 const H: f64 = 1e-6;
-/// The times that are asked.
+/// The times that are queried.
 const TIMES: [f64; 3] = [0.31, 0.7333, 1.2];
 
 /// A frame that does all that a similarity can.
@@ -59,7 +59,7 @@ fn worst<F: Real>(a: &[F], b: &[F]) -> f64 {
 fn ask<F: Real>(layer: &Layer<F>, t: f64) -> (Cache, LayerTape<F>) {
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
     tape.request(Space::Gaussians, Rows::All, Time(t));
-    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+    layer.motion.prepare(&layer.params, &[tape.query(&layer.params)], &mut cache);
     layer.at(&cache, &mut tape);
     (cache, tape)
 }
@@ -114,7 +114,7 @@ fn pictures(own: Layer<f64>, placed: Layer<f64>) {
     assert!(seen > 200, "the test must look at something: {seen}");
 }
 
-/// Along a random direction of all learnable numbers the framed answers change as the gradient states.
+/// Along a random direction of all learnable numbers the framed results change as the gradient states.
 fn gradient(mut layer: Layer<f64>, frozen: &[&str]) {
     let rng = Rng::new(81, "frame", 0);
     let weights = |like: &Table<f64>| {
@@ -140,7 +140,7 @@ fn gradient(mut layer: Layer<f64>, frozen: &[&str]) {
         let d_out = weights(tape.out());
         let d_out = SplatGrads { out: &d_out, color: None, weights: None };
         layer.backward(&cache, &mut tape, &d_out, &mut d_cache, &mut d);
-        layer.motion.finish(&layer.params, &[tape.question(&layer.params)], &mut cache, &mut d_cache, &mut d);
+        layer.motion.finish(&layer.params, &[tape.query(&layer.params)], &mut cache, &mut d_cache, &mut d);
     }
     let mut slope = 0.0;
     let keys: Vec<_> = layer.params.keys().filter(|&k| layer.params.info(k).trainable && k != SH).collect();

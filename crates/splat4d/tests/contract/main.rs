@@ -41,7 +41,7 @@ fn spacetime() {
 fn spacetime_with_features() {
     let features = Some(FeatureSpec { seed: 1 });
     let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: false, detach: false, origin: 0.5, features });
-    // What the head does is the renderer's business.
+    // The head is evaluated by the renderer.
     for life in [LifeKind::GaussHalf, LifeKind::Infinite] {
         model(&spec, ROWS, life, &[Space::Gaussians], &["head.in", "head.out"]);
     }
@@ -96,7 +96,7 @@ fn hexplane() {
 
 #[test]
 fn tracked() {
-    // One frame only; a frame on a moment that is asked, gaps, a late start and an early end.
+    // One frame only; a frame at a queried time, gaps, a late start and an early end.
     for times in [vec![0.2], vec![0.0, 0.25, 0.5, 1.0], vec![0.3, 0.9, 1.1]] {
         let spec = Spec::Tracked(TrackedSpec { times, foreground: false });
         model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);

@@ -1,4 +1,4 @@
-//! Sightings of a map whose cameras stand: made exact, and found in cameras whose detectors missed them.
+//! Sightings of a map whose cameras are fixed: made exact, and found in cameras whose detectors missed them.
 
 use super::Map;
 use crate::sfm::overlay::{self, Eye, ImagePoint};
@@ -12,17 +12,17 @@ const LEFT: usize = 100;
 /// Images in which a point is searched for next to those that show it, at most: a walk has hundreds.
 const LOOKED_IN: usize = 32;
 
-/// What windows about a track's point say.
+/// Findings of windows around a track's point.
 struct Laid {
     /// How far each of its sightings is off, by its place in the track; none where windows do not agree.
     offs: Vec<(usize, Option<[f64; 2]>)>,
-    /// Sights that show it too, and where.
+    /// Further sights of it, and the positions there.
     found: Vec<(usize, Feature)>,
 }
 
 impl Map<'_> {
-    /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find them.
-    /// Sightings whose windows do not agree go, but of cameras that would be left with few.
+    /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find
+    /// them. Sightings whose windows do not agree are removed, except in cameras that would be left with few.
     pub(super) fn overlaid(&self) -> (Vec<CameraView>, Vec<Track>) {
         let laid: Vec<Option<Laid>> = (0..self.tracks.len()).into_par_iter().map(|t| self.laid(t)).collect();
         let mut left = vec![0; self.sights.len()];
@@ -60,7 +60,7 @@ impl Map<'_> {
         (sights, tracks)
     }
 
-    /// Where the windows of a track agree; nothing where it has no place.
+    /// Positions where the windows of a track agree; none for a track without a point.
     fn laid(&self, t: usize) -> Option<Laid> {
         let (spot, track) = (self.spots[t].as_ref()?, &self.tracks[t]);
         let eye = |s: usize| Some(Eye { lens: self.lens(s), pose: self.poses[s].as_ref()? });

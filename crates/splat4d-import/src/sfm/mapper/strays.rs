@@ -1,4 +1,4 @@
-//! Cameras whose moving things contradict the others': they film another time, or another recording.
+//! Cameras whose moving objects contradict those of others: they film another time, or another recording.
 
 use super::{Link, Map, Transfer};
 use crate::sfm::tracks;
@@ -6,11 +6,11 @@ use crate::sync::median;
 use rayon::prelude::*;
 
 impl Map<'_> {
-    /// Of every sight the matches that look alike, and those of them that are on epipolar lines; of the static
-    /// background and of what moves.
+    /// Of every sight the matches, and those of them that are on epipolar lines; of the static background and of what
+    /// moves.
     pub(super) fn agreement(&self, links: &[Link]) -> Vec<[[usize; 2]; 2]> {
         let known: Vec<Option<tracks::Known>> =
-            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
+            (0..self.sights.len()).into_par_iter().map(|s| self.undistorted(s)).collect();
         let mut out = vec![[[0; 2]; 2]; self.sights.len()];
         for link in links {
             let [a, b] = link.sights;
@@ -30,10 +30,10 @@ impl Map<'_> {
     }
 }
 
-/// Cameras in which what moves contradicts the others, of what looks alike and what of it fits, of the static
-/// background and of what moves: a share fits that is small against the other cameras', where the static background
-/// fits. It shows another time, or another recording. Of four cameras of the bundled capture, one of them half a second
-/// apart, 23 % and 57 to 62 %; together 64 to 73 %.
+/// Cameras whose moving objects contradict the others, from matches and inliers, of the static background and of what
+/// moves: a share fits that is small against the other cameras', where the static background fits. It shows another
+/// time, or another recording. Of four cameras of the bundled capture, one of them half a second apart, 23 % and 57 to
+/// 62 %; together 64 to 73 %.
 pub(super) fn of(told: &[[[usize; 2]; 2]]) -> Vec<bool> {
     /// Matches that are needed.
     const TELL: usize = 40;

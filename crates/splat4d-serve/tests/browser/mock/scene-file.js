@@ -1,6 +1,6 @@
-// Stands in for the reader of playback files in the interface's tests: a synthetic scene of six pages, which arrive
+// Replaces the reader of playback files in the interface's tests: a synthetic scene of six pages, which arrive
 // late
-// on purpose. The address says what to do: `broken` fails, `slow` takes its time, `still` has one time only.
+// on purpose. The address states what to do: `broken` fails, `slow` takes its time, `still` has one time only.
 
 import { SceneError } from './errors.js';
 

@@ -1,4 +1,4 @@
-// Stands in for the streaming in the interface's tests: pages of now, then the next, then nothing.
+// Replaces the streaming in the interface's tests: pages of now, then the next, then nothing.
 
 export class Stream {
   #here = new Set();

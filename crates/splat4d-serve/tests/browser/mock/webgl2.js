@@ -1,4 +1,4 @@
-// Stands in for a backend in the interface's tests: a cloud of dots in a 2D canvas that turns with time.
+// Replaces a backend in the interface's tests: a cloud of dots in a 2D canvas that turns with time.
 
 const DOTS = 2400;
 

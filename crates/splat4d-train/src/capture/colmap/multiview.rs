@@ -1,5 +1,5 @@
-//! 4DGaussians' "multipleview" layout: a folder of frames per camera (`cam01/frame_00001.jpg`), and a COLMAP model of the first
-//! frames in `sparse_/` whose images are called `image1.jpg` by the number of their camera's folder.
+//! 4DGaussians' "multipleview" layout: a folder of frames per camera (`cam01/frame_00001.jpg`), and a COLMAP model of
+//! the first frames in `sparse_/` whose images are called `image1.jpg` by the number of their camera's folder.
 
 use super::super::account::Severity;
 use super::super::account::{Account, Aspect};
@@ -10,10 +10,10 @@ use splat4d::Result;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What the images of the model, and the folders of the cameras, are called before their numbers.
+/// Prefixes of the model's images and of the cameras' folders.
 const IMAGE: &str = "image";
 const CAMERA: &str = "cam";
-/// Where the layout's scripts write the dense cloud.
+/// Path of the dense cloud of the layout's scripts.
 const POINTS: &str = "points3D_multipleview.ply";
 
 /// Camera folders by their numbers.

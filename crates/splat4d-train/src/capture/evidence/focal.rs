@@ -1,5 +1,5 @@
-//! Focal lengths and distortion: those at which matches are on their epipolar lines and colours of points are those of the
-//! images.
+//! Focal lengths and distortion: those at which matches are on their epipolar lines and colours of points are those of
+//! the images.
 
 use super::super::Capture;
 use super::super::account::Severity;
@@ -10,7 +10,7 @@ use super::pairs::{self, Match};
 use super::points;
 use splat4d::math::Se3;
 
-/// Factors that are tried are powers of this, up to so many both ways: a quarter to four times.
+/// Factors that are tried are powers of this, up to this many both ways: a quarter to four times.
 const STEP: f64 = 1.189_207_115_002_721;
 const STEPS: i32 = 8;
 /// Steps to half and to twice the length.
@@ -23,12 +23,12 @@ const REACH: f64 = 1.0;
 const BETTER: f64 = 1.5;
 const ENOUGH: f64 = 30.0;
 const SHARE: f64 = 0.15;
-/// How well matches may fit half or twice the focal length, of as read, where they determine it.
+/// Largest share of the error as read that matches may have at half or twice the focal length, where they determine it.
 const FLAT: f64 = 0.7;
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;
 
-/// What the factors by which focal lengths are tried give, by steps.
+/// Results for the tried factors of focal lengths, by steps.
 struct Tried(Vec<f64>);
 
 impl Tried {
@@ -47,27 +47,27 @@ impl Tried {
     }
 }
 
-/// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or there
-/// is no evidence. `matches`: none were searched for where points have shown that poses are right.
+/// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or
+/// there is no evidence. `matches`: none were searched for where points have shown that poses are right.
 pub(super) fn check(
     capture: &Capture,
     matches: Option<&[Match]>,
-    looks: &[SmallImage],
+    images: &[SmallImage],
     poses: &[Se3],
 ) -> Option<Finding> {
-    by_points(capture, looks, poses).or_else(|| by_matches(matches?, looks, poses))
+    by_points(capture, images, poses).or_else(|| by_matches(matches?, images, poses))
 }
 
-fn by_points(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
+fn by_points(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     capture.points.as_ref()?;
-    let gain = |trial: Trial| points::gain_if(capture, looks, poses, trial).unwrap_or(0.0);
+    let gain = |trial: Trial| points::gain_if(capture, images, poses, trial).unwrap_or(0.0);
     let own = gain(Trial::AS_READ);
     let percent = |gain: f64| 100.0 * gain.max(0.0);
     let as_read = format!("by {:.0} % as read", percent(own));
     let how = |gain: f64| format!("colours of initial points fit their images by {:.0} %", percent(gain));
     let wrong = |gain: f64| gain >= points::CONVINCES.1 && gain >= own + COLOURS;
     // Images that were undistorted, with the cameras of the originals.
-    if looks.iter().any(SmallImage::is_distorted) {
+    if images.iter().any(SmallImage::is_distorted) {
         let straight = gain(Trial { straight: true, ..Trial::AS_READ });
         if wrong(straight) {
             let what = format!(
@@ -91,19 +91,19 @@ fn by_points(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<F
         let remedy = "Images that were stretched, such as to 16:9, have another focal length across than down.";
         return Some(warned(what, remedy));
     }
-    (best != 0 && wrong(both.at(best))).then(|| warning(&how(both.at(best)), best, looks, &as_read))
+    (best != 0 && wrong(both.at(best))).then(|| warning(&how(both.at(best)), best, images, &as_read))
 }
 
-fn by_matches(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
+fn by_matches(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let weight = |residual: f64| (1.0 - (residual / REACH).powi(2)).max(0.0);
-    let fit = Tried::new(|times| pairs::residuals(matches, looks, poses, times).into_iter().map(weight).sum());
+    let fit = Tried::new(|times| pairs::residuals(matches, images, poses, times).into_iter().map(weight).sum());
     let best = fit.best();
     if fit.at(best) < ENOUGH.max(SHARE * matches.len() as f64) {
         return None;
     }
     if best.abs() > RIGHT && fit.at(best) >= BETTER * fit.at(0) {
         let how = format!("matches between images fit {:.1} times as well", fit.at(best) / fit.at(0).max(1.0));
-        return Some(warning(&how, best, looks, "than as read"));
+        return Some(warning(&how, best, images, "than as read"));
     }
     let flat = fit.at(OCTAVE).max(fit.at(-OCTAVE)) >= FLAT * fit.at(0);
     let percent = |step: i32| 100.0 * fit.at(step) / fit.at(0).max(1.0);
@@ -121,8 +121,8 @@ fn by_matches(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> Option<
     })
 }
 
-fn warning(how: &str, step: i32, looks: &[SmallImage], as_read: &str) -> Finding {
-    let (times, own) = (STEP.powi(step), looks[0].camera.intrinsics.fx);
+fn warning(how: &str, step: i32, images: &[SmallImage], as_read: &str) -> Finding {
+    let (times, own) = (STEP.powi(step), images[0].camera.intrinsics.fx);
     let what = format!(
         "Focal lengths are probably wrong: {how} if they are {times:.2} times as long ({:.0} px in place of {own:.0} px), {as_read}.",
         times * own

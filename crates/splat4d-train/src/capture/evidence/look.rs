@@ -18,24 +18,24 @@ pub(super) struct Detail {
     pub(super) features: usize,
 }
 
-/// What poses are checked with.
+/// Images for checks of poses.
 pub(super) const COARSE: Detail = Detail { side: 320, features: 350 };
-/// What motion is searched for with: a mover is a small part of an image.
+/// Images for the search for motion: a mover is a small part of an image.
 pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
 /// Weight of a mask or alpha from which a pixel shows something.
 const SHOWN: f32 = 0.5;
-/// Foreground below this share of an image, or above the other, states nothing of a place.
+/// Foreground below this share of an image, or above the other, tells nothing about a position.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
-/// A feature: what it looks like, and its ray without distortion (x/z, y/z).
+/// A feature: its descriptor, and its ray without distortion (x/z, y/z).
 pub(super) struct Mark {
     pub(super) feature: Feature,
     pub(super) ray: [f64; 2],
 }
 
-/// What a mask or alpha shows of an image.
+/// Foreground of an image by mask or alpha.
 pub(super) struct Shown {
     /// [height · width] of the small image, from 0 to 1.
     pub(super) weights: Vec<f32>,
@@ -78,13 +78,13 @@ pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Smal
 }
 
 /// Finds the features of all.
-pub(super) fn describe(looks: &mut [SmallImage], detail: Detail) {
-    describe_each(&mut looks.iter_mut().collect::<Vec<_>>(), detail);
+pub(super) fn describe(images: &mut [SmallImage], detail: Detail) {
+    describe_each(&mut images.iter_mut().collect::<Vec<_>>(), detail);
 }
 
 /// [`describe`] of some.
-pub(super) fn describe_each(looks: &mut [&mut SmallImage], detail: Detail) {
-    looks.par_iter_mut().for_each(|look| {
+pub(super) fn describe_each(images: &mut [&mut SmallImage], detail: Detail) {
+    images.par_iter_mut().for_each(|look| {
         let limits = Limits { contrast: CONTRAST, most: detail.features };
         let found = find(&grey(&look.color), limits, &|_, _| true);
         let mark = |feature: Feature| Some(Mark { ray: look.ray(feature.pixel)?, feature });
@@ -102,7 +102,7 @@ fn reduced(raster: &Raster, channel: usize, k: usize) -> Vec<f32> {
     sums.into_iter().map(|sum| (sum as f64 / full) as f32).collect()
 }
 
-/// Sums of boxes: whole numbers, as most of the time of looking at a large image would go here.
+/// Box sums in integers, because they dominate the time for a large image.
 fn box_sums<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, channel: usize, k: usize) -> Vec<u64> {
     let (width, height) = (raster.width / k, raster.height / k);
     let mut out = vec![0u64; width * height];
@@ -221,8 +221,8 @@ impl SmallImage {
         self.camera.lens != Lens::Pinhole
     }
 
-    /// The colour at which a point of the world is seen from `pose` by this camera and lens of the file; `None`: outside,
-    /// or hidden by its mask or alpha.
+    /// The colour at which a point of the world is seen from `pose` by this camera and lens of the file; `None`:
+    /// outside, or hidden by its mask or alpha.
     pub(super) fn color_of(
         &self,
         (camera, lens): &(Camera, Distortion),
@@ -238,7 +238,7 @@ impl SmallImage {
     }
 }
 
-/// Where a point is seen in the image file; `None`: behind the camera or outside.
+/// Position of a point in the image file; `None`: behind the camera or outside.
 pub(super) fn pixel_of(camera: &Camera, lens: &Distortion, pose: &Se3, point: [f64; 3]) -> Option<[f64; 2]> {
     let [x, y, z] = pose.apply(point);
     if z <= 0.0 {

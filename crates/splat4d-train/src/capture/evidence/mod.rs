@@ -25,7 +25,7 @@ use splat4d::math::Se3;
 use std::collections::BTreeSet;
 
 /// Images that are examined, at most; and at least, where they are large.
-const LOOKS: [usize; 2] = [4, 10];
+const CHECKED: [usize; 2] = [4, 10];
 /// Pixels that are decoded, at most: a second of one core.
 const PIXELS: usize = 40_000_000;
 /// Mean part of images that their masks show, from which these hide nothing: less than half a level of 8 bits.
@@ -41,14 +41,14 @@ struct Measure {
     foreground: Option<f64>,
 }
 
-/// What [`Capture::check_poses`] found.
+/// Result of [`Capture::check_poses`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PoseCheck {
     /// The convention that the poses are probably written in; `None`: as they were read, or undetermined.
     pub written_as: Option<Poses>,
-    /// What was found, or why nothing could be.
+    /// The finding, or the reason for none.
     pub finding: Finding,
-    /// What else images say: of single poses, focal lengths and masks.
+    /// Further findings from images: single poses, focal lengths and masks.
     pub more: Vec<Finding>,
     /// Whether the finding is another convention.
     misread: bool,
@@ -57,22 +57,22 @@ pub struct PoseCheck {
 impl Capture {
     /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
     pub fn check_poses(&self) -> PoseCheck {
-        let mut looks = look::take(self, &self.looked_at(), look::COARSE);
+        let mut images = look::take(self, &self.looked_at(), look::COARSE);
         let mut matches = None;
-        let mut check = self.judge(&mut looks, &mut matches);
+        let mut check = self.judge(&mut images, &mut matches);
         if !check.misread {
-            let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
-            check.more.extend(focal::check(self, matches.as_deref(), &looks, &poses));
-            check.more.extend(check_masks(&looks, &poses));
+            let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
+            check.more.extend(focal::check(self, matches.as_deref(), &images, &poses));
+            check.more.extend(check_masks(&images, &poses));
             check.more.extend(copies::check(self));
-            let pixels: usize = looks.iter().map(|l| l.camera.width * l.camera.height).sum();
-            check.more.extend(outliers::check(self, looks, PIXELS.saturating_sub(pixels)));
+            let pixels: usize = images.iter().map(|l| l.camera.width * l.camera.height).sum();
+            check.more.extend(outliers::check(self, images, PIXELS.saturating_sub(pixels)));
         }
         check
     }
 
-    /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than the
-    /// points. Opens a few depth maps.
+    /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than
+    /// the points. Opens a few depth maps.
     pub(super) fn check_points(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let warn = |what: String, remedy: &str| Finding {
@@ -113,8 +113,8 @@ impl Capture {
         findings
     }
 
-    /// The verdict by these images; features are found and matched if points do not say enough.
-    fn judge(&self, looks: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
+    /// The verdict by these images; features are found and matched if points do not suffice.
+    fn judge(&self, images: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
         let mut conventions = vec![Poses::STATED];
         conventions.extend(self.convention.others());
         let posed = |f: &Frame, p: Poses| match p {
@@ -126,20 +126,20 @@ impl Capture {
         };
         let mut measures = vec![Measure::default(); conventions.len()];
         let spread = points::frames(self);
-        let seen: Vec<usize> = looks.iter().map(|l| l.frame).collect();
+        let seen: Vec<usize> = images.iter().map(|l| l.frame).collect();
         let poses: Vec<Option<Vec<Se3>>> = conventions.iter().map(|&p| all(&seen, p)).collect();
         for ((m, &p), poses) in measures.iter_mut().zip(&conventions).zip(&poses) {
             let (Some(spread_poses), Some(poses)) = (all(&spread, p), poses) else { continue };
-            m.points = points::measure(self, (&spread, &spread_poses), (looks, poses));
-            m.foreground = silhouettes::measure(looks, poses);
+            m.points = points::measure(self, (&spread, &spread_poses), (images, poses));
+            m.foreground = silhouettes::measure(images, poses);
         }
-        // Points whose colours agree say enough.
+        // Points whose colours agree suffice.
         if !measures[0].points.convinces() {
             let matches = matches.get_or_insert_with(|| {
-                look::describe(looks, look::COARSE);
-                pairs::matches(looks)
+                look::describe(images, look::COARSE);
+                pairs::matches(images)
             });
-            pairs::measure(matches, looks, &poses).into_iter().zip(&mut measures).for_each(|(p, m)| m.pairs = p);
+            pairs::measure(matches, images, &poses).into_iter().zip(&mut measures).for_each(|(p, m)| m.pairs = p);
         }
         self.conclude(&conventions, &measures)
     }
@@ -147,13 +147,13 @@ impl Capture {
     /// The frames that are examined: cameras of one time in their order, or frames of a moving camera in a row.
     fn looked_at(&self) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
-        let most = (PIXELS / pixels).clamp(LOOKS[0], LOOKS[1]);
+        let most = (PIXELS / pixels).clamp(CHECKED[0], CHECKED[1]);
         let mut counts = std::collections::BTreeMap::<usize, Vec<usize>>::new();
         for &i in &self.train {
             counts.entry(self.frames[i].index).or_default().push(i);
         }
         let fullest = counts.into_values().rev().max_by_key(Vec::len).unwrap_or_default();
-        if fullest.len() >= LOOKS[0].min(self.train.len()) {
+        if fullest.len() >= CHECKED[0].min(self.train.len()) {
             return fullest.into_iter().take(most).collect();
         }
         if self.fixed_cameras() {
@@ -231,7 +231,7 @@ impl Capture {
         );
         let (written_as, remedy) = match self.poses == Poses::STATED {
             true => (Some(poses), format!("Read them so: --poses {poses}.")),
-            false => (None, format!("They are read as --poses {} says: leave it out, or give another.", self.poses)),
+            false => (None, format!("They are read by --poses {}: leave it out, or give another.", self.poses)),
         };
         PoseCheck {
             written_as,
@@ -253,22 +253,22 @@ fn other_unit(ratio: f64, by: &str, file: &DepthFile) -> String {
     )
 }
 
-/// What masks and alpha say of themselves: white counts.
-fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
+/// Polarity of masks and alpha: white counts.
+fn check_masks(images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let percent = |x: f64| 100.0 * x;
-    let (severity, aspect, what, remedy) = match silhouettes::masks(looks, poses) {
+    let (severity, aspect, what, remedy) = match silhouettes::masks(images, poses) {
         silhouettes::Masks::Fine => return None,
         silhouettes::Masks::Inverted(part, share, of_edge) => (
             Severity::Warning,
             Aspect::Assumed,
             format!(
-                "Masks are probably inverted (white counts): what they hide is at one place, which the cameras look at, in {:.0} % of \
+                "Masks are probably inverted (white counts): what they hide is at one place, which the cameras point at, in {:.0} % of \
                  the images; they show {:.0} % of the images and {:.0} % of their edges.",
                 percent(part),
                 percent(share),
                 percent(of_edge)
             ),
-            "Invert them, unless what they hide is not wanted.",
+            "Invert them, unless the hidden part is not needed.",
         ),
         silhouettes::Masks::Unsure(images, share) if share >= HIDES_NOTHING => (
             Severity::Note,
@@ -292,22 +292,22 @@ fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     Some(Finding { severity, aspect: Some(aspect), what, remedy: remedy.into() })
 }
 
-/// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches between
-/// images; `None`: undetermined. `unsure` are frames whose sizes do not decide.
+/// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches
+/// between images; `None`: undetermined. `unsure` are frames whose sizes do not decide.
 pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
-    let others = (0..capture.frames.len()).filter(|i| !unsure.contains(i)).take(LOOKS[0]);
-    let some: Vec<usize> = unsure.iter().copied().take(LOOKS[1] - LOOKS[0]).collect();
+    let others = (0..capture.frames.len()).filter(|i| !unsure.contains(i)).take(CHECKED[0]);
+    let some: Vec<usize> = unsure.iter().copied().take(CHECKED[1] - CHECKED[0]).collect();
     let measured = [true, false].map(|upright| {
         let asked = some.iter().filter_map(|&i| look::one(capture, i, upright));
         let sure = others.clone().filter_map(|i| look::one(capture, i, true));
-        let mut looks: Vec<SmallImage> = asked.chain(sure).collect();
+        let mut images: Vec<SmallImage> = asked.chain(sure).collect();
         let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
-        let poses: Vec<Se3> = looks.iter().map(pose).collect();
-        let count = looks.iter().filter(|l| some.contains(&l.frame)).count();
-        let gain = points::gain_of(capture, &looks[..count], &poses[..count]);
-        look::describe(&mut looks, look::COARSE);
-        let matches = pairs::matches(&looks);
-        (gain, pairs::measure(&matches, &looks, &[Some(poses)])[0])
+        let poses: Vec<Se3> = images.iter().map(pose).collect();
+        let count = images.iter().filter(|l| some.contains(&l.frame)).count();
+        let gain = points::gain_of(capture, &images[..count], &poses[..count]);
+        look::describe(&mut images, look::COARSE);
+        let matches = pairs::matches(&images);
+        (gain, pairs::measure(&matches, &images, &[Some(poses)])[0])
     });
     let [(gain, pairs), (stored_gain, stored_pairs)] = measured;
     if let (Some(a), Some(b)) = (gain, stored_gain)
@@ -326,7 +326,7 @@ impl Measure {
         points + self.pairs.share() + 0.5 * self.foreground.unwrap_or(0.0)
     }
 
-    /// What speaks for the poses as they are read, or why nothing does.
+    /// Evidence for the poses as read, or the reason why there is none.
     fn agrees(&self) -> Finding {
         let mut parts = Vec::new();
         if self.points.convinces() {

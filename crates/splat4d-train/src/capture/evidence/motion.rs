@@ -64,16 +64,16 @@ impl Capture {
         let mut wanted: Vec<usize> = pairs.iter().flatten().map(|&k| frames[k]).collect();
         wanted.sort_unstable();
         wanted.dedup();
-        let mut looks = look::take(self, &wanted, look::FINE);
-        look::describe(&mut looks, look::FINE);
-        let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
-        let place = |k: usize| looks.iter().position(|l| l.frame == frames[k]);
+        let mut images = look::take(self, &wanted, look::FINE);
+        look::describe(&mut images, look::FINE);
+        let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
+        let place = |k: usize| images.iter().position(|l| l.frame == frames[k]);
         let pairs: Vec<[usize; 2]> = pairs.iter().filter_map(|&[a, b]| Some([place(a)?, place(b)?])).collect();
         let counts: Vec<[f64; 2]> = pairs
             .par_iter()
             .map(|&[a, b]| {
-                let matches = pairs::between([a, b], &looks[a].marks, &looks[b].marks, pairs::STRICT);
-                counts(&matches, |m| pairs::distance(m, &looks, &poses))
+                let matches = pairs::between([a, b], &images[a].marks, &images[b].marks, pairs::STRICT);
+                counts(&matches, |m| pairs::distance(m, &images, &poses))
             })
             .collect();
         let [agree, moved] = counts.iter().fold([0.0; 2], |s, c| [s[0] + c[0], s[1] + c[1]]);

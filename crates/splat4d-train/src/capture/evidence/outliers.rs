@@ -1,5 +1,5 @@
-//! Single wrong poses among right ones: the identity, the pose of another image, a jump out of a path. Each is compared with
-//! matches between its image and others; nothing else raises a warning.
+//! Single wrong poses among right ones: the identity, the pose of another image, a jump out of a path. Each is compared
+//! with matches between its image and others; nothing else raises a warning.
 
 use super::super::account::Severity;
 use super::super::account::first_names;
@@ -14,26 +14,27 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Captures of at most so many places are compared image by image; of larger ones the conspicuous poses.
+/// Captures of at most this many places are compared image by image; of larger ones the conspicuous poses.
 const ALL: usize = 24;
-/// Conspicuous poses that are looked into at most, and of all places: where more are so, it is how the capture is.
+/// Conspicuous poses that are examined at most, and share of all positions: more are a property of the capture.
 const SUSPECTS: usize = 4;
 const FEW: f64 = 0.2;
 /// Images before and after that an image is compared with: in most captures they overlap.
 const BESIDE: usize = 2;
-/// Matches of two images that show one place: chance makes fewer.
+/// Matches of two images that show one scene: chance makes fewer.
 const OVERLAP: usize = 20;
-/// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right poses less than
-/// all, and a wrong pose fits what is near its lines by chance. Between them nothing is said.
+/// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right
+/// poses less than all, and a wrong pose fits what is near its lines by chance. Between them nothing is reported.
 const FITS: [f64; 2] = [0.4, 0.15];
-/// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of one scene
-/// gain 0.14 (see `points`). Looking for features takes forty times as long.
+/// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of
+/// one scene gain 0.14 (see `points`). Feature detection takes forty times as long.
 const VOUCHED: f64 = 0.3;
 /// Gain of an image below which it does not fit the points, where the images in the middle gain so much.
 const STRANGE: (f64, f64) = (0.1, 0.35);
 /// Images that are compared with points for that, evenly chosen, and their pixels: a tenth of a second.
 const SEEN: (usize, usize) = (64, 8_000_000);
-/// A jump is this many times as far as usual steps and as the step over it, to and from; and a turn is so many degrees.
+/// A jump is this many times as far as usual steps and as the step over it, to and from; and a turn is this many
+/// degrees.
 const JUMP: f64 = 8.0;
 const TURN: f64 = 30.0;
 /// Entries of an axis-parallel rotation are this near to 0 or 1.
@@ -42,7 +43,7 @@ const EXACT: f64 = 1e-9;
 /// Why a pose is conspicuous.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Sign {
-    /// The camera is at the origin and looks along an axis.
+    /// The camera is at the origin and images along an axis.
     Identity,
     /// Another image has exactly this pose.
     Repeated,
@@ -60,59 +61,59 @@ impl Sign {
     }
 }
 
-/// Looks for single wrong poses; `looks` are images that are read already.
-pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
+/// Searches for single wrong poses; `images` are images that were already read.
+pub(super) fn check(capture: &Capture, images: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
     let order = places(capture);
     let signs = signs(capture, &order);
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
     let (chosen, compared) = chosen(&order, &signs, (pixels / size).max(2 * BESIDE + 1));
     let frames: Vec<usize> = chosen.iter().map(|&k| order[k]).collect();
-    let mut looks: Vec<SmallImage> = looks.into_iter().filter(|l| frames.contains(&l.frame)).collect();
-    let missing: Vec<usize> = frames.iter().copied().filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
-    looks.extend(look::take(capture, &missing, look::COARSE));
-    looks.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
+    let mut images: Vec<SmallImage> = images.into_iter().filter(|l| frames.contains(&l.frame)).collect();
+    let missing: Vec<usize> = frames.iter().copied().filter(|f| images.iter().all(|l| l.frame != *f)).collect();
+    images.extend(look::take(capture, &missing, look::COARSE));
+    images.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
     let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
     let gain = |l: &SmallImage| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
-    let strange = strange(capture, &order, &looks, &gain);
+    let strange = strange(capture, &order, &images, &gain);
     let vouched = |l: &SmallImage| gain(l).is_some_and(|gain| gain >= VOUCHED);
     let place = |l: &SmallImage| order.iter().position(|f| *f == l.frame).unwrap_or(0);
-    let doubtful: Vec<usize> = looks.par_iter().filter(|l| !vouched(l)).map(place).collect();
-    looks.retain(|l| doubtful.iter().any(|k| k.abs_diff(place(l)) <= BESIDE));
+    let doubtful: Vec<usize> = images.par_iter().filter(|l| !vouched(l)).map(place).collect();
+    images.retain(|l| doubtful.iter().any(|k| k.abs_diff(place(l)) <= BESIDE));
     // Positions of the images in the order; unreadable ones have none.
-    let at: Vec<usize> = looks.iter().filter_map(|l| order.iter().position(|f| *f == l.frame)).collect();
-    let mut bare: Vec<&mut SmallImage> = looks.iter_mut().filter(|l| l.marks.is_empty()).collect();
+    let at: Vec<usize> = images.iter().filter_map(|l| order.iter().position(|f| *f == l.frame)).collect();
+    let mut bare: Vec<&mut SmallImage> = images.iter_mut().filter(|l| l.marks.is_empty()).collect();
     look::describe_each(&mut bare, look::COARSE);
     let suspect = |k: usize| signs.contains_key(&at[k]);
     let mut wanted = Vec::new();
-    for a in 0..looks.len() {
-        for b in a + 1..looks.len() {
+    for a in 0..images.len() {
+        for b in a + 1..images.len() {
             if at[b].abs_diff(at[a]) <= BESIDE || suspect(a) || suspect(b) {
                 wanted.push([a, b]);
             }
         }
     }
-    let poses: Vec<Se3> = looks.iter().map(|l| capture.frames[l.frame].source.cam_from_world).collect();
+    let poses: Vec<Se3> = images.iter().map(|l| capture.frames[l.frame].source.cam_from_world).collect();
     let measured: Vec<Pair> = wanted
         .into_par_iter()
         .filter_map(|[a, b]| {
-            let matches: Vec<Match> = pairs::between([a, b], &looks[a].marks, &looks[b].marks, pairs::STRICT);
+            let matches: Vec<Match> = pairs::between([a, b], &images[a].marks, &images[b].marks, pairs::STRICT);
             (matches.len() >= OVERLAP).then(|| Pair {
-                looks: [a, b],
+                images: [a, b],
                 matches: matches.len(),
-                fitting: pairs::fitting(&matches, &looks, &poses),
+                fitting: pairs::fitting(&matches, &images, &poses),
             })
         })
         .collect();
-    let told = |k: usize| (capture.frames[looks[k].frame].image.display().to_string(), signs.get(&at[k]).copied());
-    let wrong = wrong(looks.len(), &measured);
+    let told = |k: usize| (capture.frames[images[k].frame].image.display().to_string(), signs.get(&at[k]).copied());
+    let wrong = wrong(images.len(), &measured);
     let mut findings = Vec::new();
-    let known: Vec<usize> = wrong.iter().map(|&k| looks[k].frame).collect();
+    let known: Vec<usize> = wrong.iter().map(|&k| images[k].frame).collect();
     findings.extend(warning(&wrong, &measured, &told));
     let strange = strange.filter(|s| !s.frames.iter().any(|f| known.contains(f)));
     let named: Vec<usize> = strange.iter().flat_map(|s| s.frames.clone()).chain(known).collect();
     findings.extend(strange.map(|s| s.finding(capture)));
     let good = |k: usize| measured.iter().any(|p| p.has(k) && p.share() >= FITS[0]);
-    let open: Vec<String> = (0..looks.len())
+    let open: Vec<String> = (0..images.len())
         .filter(|&k| signs.get(&at[k]) == Some(&Sign::Identity) && !good(k) && !wrong.contains(&k))
         .map(|k| told(k).0)
         .collect();
@@ -132,8 +133,8 @@ pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) ->
         )));
     }
     // Neither points nor matches show that these are right or wrong.
-    let silent: Vec<String> = (0..looks.len())
-        .filter(|&k| doubtful.contains(&at[k]) && !good(k) && !named.contains(&looks[k].frame))
+    let silent: Vec<String> = (0..images.len())
+        .filter(|&k| doubtful.contains(&at[k]) && !good(k) && !named.contains(&images[k].frame))
         .map(|k| told(k).0)
         .filter(|name| !open.contains(name))
         .collect();
@@ -179,20 +180,20 @@ impl Strange {
     }
 }
 
-/// Looks for such images among those that are read already and some more.
+/// Searches for such images among those that were already read and some more.
 fn strange(
     capture: &Capture,
     order: &[usize],
-    looks: &[SmallImage],
+    images: &[SmallImage],
     gain: &(dyn Fn(&SmallImage) -> Option<f64> + Sync),
 ) -> Option<Strange> {
     capture.points.as_ref()?;
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
     let most = SEEN.0.min(SEEN.1 / size).max(1);
     let more = order.iter().step_by(order.len().div_ceil(most).max(1)).copied();
-    let more: Vec<usize> = more.filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
+    let more: Vec<usize> = more.filter(|f| images.iter().all(|l| l.frame != *f)).collect();
     let others = look::take(capture, &more, look::COARSE);
-    let all: Vec<&SmallImage> = looks.iter().chain(&others).collect();
+    let all: Vec<&SmallImage> = images.iter().chain(&others).collect();
     let mut gains: Vec<(f64, usize)> = all.par_iter().filter_map(|l| Some((gain(l)?, l.frame))).collect();
     gains.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     let middle = gains.get(gains.len() / 2)?.0;
@@ -204,7 +205,7 @@ fn strange(
 
 /// Matches of two images.
 struct Pair {
-    looks: [usize; 2],
+    images: [usize; 2],
     matches: usize,
     fitting: usize,
 }
@@ -215,7 +216,7 @@ impl Pair {
     }
 
     fn has(&self, look: usize) -> bool {
-        self.looks.contains(&look)
+        self.images.contains(&look)
     }
 }
 
@@ -224,7 +225,7 @@ fn wrong(count: usize, pairs: &[Pair]) -> Vec<usize> {
     let good = |k: usize| pairs.iter().any(|p| p.has(k) && p.share() >= FITS[0]);
     let is_wrong = |&k: &usize| {
         let mut bad = pairs.iter().filter(|p| p.has(k) && p.share() < FITS[1]);
-        !good(k) && bad.any(|p| good(p.looks[0] + p.looks[1] - k))
+        !good(k) && bad.any(|p| good(p.images[0] + p.images[1] - k))
     };
     let wrong: Vec<usize> = (0..count).filter(is_wrong).collect();
     let compared = (0..count).filter(|&k| pairs.iter().any(|p| p.has(k))).count();
@@ -257,8 +258,8 @@ fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Opt
     Some(Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy })
 }
 
-/// One frame of every place that has a pose of its own: of a fixed camera the one that is nearest to the time of which most is
-/// seen, of moving ones all for training; ordered as they were taken.
+/// One frame of every position that has a pose of its own: of a fixed camera the one that is nearest to the time of
+/// which most is seen, of moving ones all for training; ordered as they were taken.
 fn places(capture: &Capture) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     capture.train.iter().for_each(|&i| *counts.entry(capture.frames[i].index).or_default() += 1);
@@ -308,7 +309,7 @@ fn signs(capture: &Capture, order: &[usize]) -> BTreeMap<usize, Sign> {
     out
 }
 
-/// Whether a camera is at the origin of its capture's world and looks along an axis.
+/// Whether a camera is at the origin of its capture's world and images along an axis.
 fn is_identity(frame: &Frame, offset: [f64; 3]) -> bool {
     let center = frame.source.center();
     let whole = |v: &f64| v.abs() < EXACT || (v.abs() - 1.0).abs() < EXACT;
@@ -372,7 +373,7 @@ mod tests {
         assert_eq!(jumps(&far), [5]);
         let turned: Vec<Se3> = moved(5, Se3::look_at([0.5, 4.0, 1.0], [0.5, 8.0, 0.0], [0.0, 0.0, 1.0]));
         assert_eq!(jumps(&turned), [5]);
-        // A cut to another place is no jump out and back.
+        // A cut to another scene is not a jump out and back.
         let cut: Vec<Se3> =
             path.iter().enumerate().map(|(i, p)| if i < 6 { *p } else { at(9.0 + 0.1 * i as f64) }).collect();
         assert!(jumps(&cut).is_empty());
@@ -381,7 +382,7 @@ mod tests {
 
     #[test]
     fn an_image_whose_matches_fit_no_other_is_reported() {
-        let pair = |a: usize, b: usize, fitting: usize| Pair { looks: [a, b], matches: 40, fitting };
+        let pair = |a: usize, b: usize, fitting: usize| Pair { images: [a, b], matches: 40, fitting };
         let pairs = [pair(0, 1, 30), pair(1, 2, 2), pair(0, 2, 1), pair(2, 3, 0), pair(3, 4, 28), pair(1, 3, 25)];
         assert_eq!(wrong(5, &pairs), [2]);
         // Of two images alone it is not known which is wrong.

@@ -16,33 +16,34 @@ const NEAR: f64 = 1.5;
 const PARALLEL: f64 = 0.006;
 /// Of the cameras' spread: cameras nearer to one another have the same position.
 const ONE_PLACE: f64 = 1e-6;
-/// Matches that one convention fits and the other does not, at least, and how many times as many as the other way round.
+/// Matches that one convention fits and the other does not, at least, and how many times as many as the other way
+/// round.
 const MORE: (usize, usize) = (20, 4);
 /// Of its matches, how many the poses as read fit at most where another convention is right.
 const RIVAL: f64 = 0.8;
 /// Share of the matches that a right convention fits at least: many are chance.
 const FITTING: f64 = 0.2;
 
-/// Two features that look alike, of these looks: their rays.
+/// A match of features of these two images: their rays.
 pub(super) struct Match {
-    looks: [usize; 2],
+    images: [usize; 2],
     rays: [[f64; 2]; 2],
 }
 
 #[cfg(test)]
 impl Match {
-    /// The two looks.
-    pub(super) fn looks(&self) -> [usize; 2] {
-        self.looks
+    /// The two images.
+    pub(super) fn images(&self) -> [usize; 2] {
+        self.images
     }
 }
 
-/// What matches say of one convention.
+/// Evidence of matches for one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
     pub(super) matches: usize,
     pub(super) fitting: usize,
-    /// Matches that it fits and the poses as read do not, and the other way round.
+    /// Matches that it fits and the poses as read do not, and vice versa.
     gained: usize,
     lost: usize,
 }
@@ -58,27 +59,27 @@ impl Measure {
         self.fitting >= MORE.0 && self.share() >= FITTING
     }
 
-    /// Whether matches say that the poses as read are better.
+    /// Whether matches indicate that the poses as read are better.
     pub(super) fn contradicts(&self) -> bool {
         self.lost >= MORE.0 && self.lost >= MORE.1 * self.gained
     }
 }
 
-/// Whether matches say that poses are written in this convention.
+/// Whether matches indicate that poses are written in this convention.
 pub(super) fn prefers(m: &Measure) -> bool {
     let stated = m.fitting + m.lost - m.gained;
     m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost && stated as f64 <= RIVAL * m.fitting as f64
 }
 
-/// Mutual best matches of all pairs of looks but those of one pose, which fits them in any convention.
-pub(super) fn matches(looks: &[SmallImage]) -> Vec<Match> {
-    let all = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b]));
-    let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&looks[a].camera, &looks[b].camera)).collect();
-    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks, RATIO)).collect()
+/// Mutual best matches of all pairs of images except those of one pose, which agree in any convention.
+pub(super) fn matches(images: &[SmallImage]) -> Vec<Match> {
+    let all = (0..images.len()).flat_map(|a| (a + 1..images.len()).map(move |b| [a, b]));
+    let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&images[a].camera, &images[b].camera)).collect();
+    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &images[a].marks, &images[b].marks, RATIO)).collect()
 }
 
 /// Mutual best matches of two images whose second best is 1/`ratio` times farther away.
-pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64) -> Vec<Match> {
+pub(super) fn between(images: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64) -> Vec<Match> {
     let mut back = vec![(u32::MAX, 0); to.len()];
     let mut forth = Vec::with_capacity(from.len());
     for (i, a) in from.iter().enumerate() {
@@ -87,7 +88,7 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64)
             let d = a.feature.distance(&b.feature);
             back[j] = back[j].min((d, i));
             if d < first.0 {
-                // A place may have two features, of two directions: they are no rivals.
+                // A point may have two features, of two directions: they are not rivals.
                 if first.0 < u32::MAX && to[first.1].feature.pixel != b.feature.pixel {
                     second = first.0;
                 }
@@ -100,20 +101,20 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64)
     }
     let good = |(i, ((d, j), second)): (usize, ((u32, usize), u32))| {
         let clear = f64::from(d).sqrt() < ratio * f64::from(second).sqrt();
-        (d < u32::MAX && clear && back[j].1 == i).then(|| Match { looks, rays: [from[i].ray, to[j].ray] })
+        (d < u32::MAX && clear && back[j].1 == i).then(|| Match { images, rays: [from[i].ray, to[j].ray] })
     };
     forth.into_iter().enumerate().filter_map(good).collect()
 }
 
-/// Measures every convention; `poses` are those of the looks in each, the first as read.
-pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
+/// Measures every convention; `poses` are those of the images in each convention, the first as read.
+pub(super) fn measure(matches: &[Match], images: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
     let fits: Vec<Vec<bool>> = poses
         .iter()
         .map(|poses| match poses {
             Some(poses) => {
                 let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
                 let least = least(&centers);
-                matches.iter().map(|m| fits(m, looks, poses, least)).collect()
+                matches.iter().map(|m| fits(m, images, poses, least)).collect()
             }
             None => vec![false; matches.len()],
         })
@@ -129,44 +130,44 @@ pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<V
         .collect()
 }
 
-/// How many of the matches of two looks their poses fit.
-pub(super) fn fitting(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> usize {
+/// Number of matches of two images that agree with their poses.
+pub(super) fn fitting(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> usize {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
-    matches.iter().filter(|m| fits(m, looks, poses, least)).count()
+    matches.iter().filter(|m| fits(m, images, poses, least)).count()
 }
 
-/// Baselines from which cameras stand in two places.
+/// Baselines from which cameras are in two places.
 fn least(centers: &[[f64; 3]]) -> f64 {
     let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
     ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))
 }
 
-/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image; infinite
-/// where the rays do not meet in front of both cameras.
-pub(super) fn residuals(matches: &[Match], looks: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
+/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image;
+/// infinite where the rays do not meet in front of both cameras.
+pub(super) fn residuals(matches: &[Match], images: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
     let residual = |m: &Match| {
-        let m = Match { looks: m.looks, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
-        let [a, b] = m.looks;
+        let m = Match { images: m.images, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
+        let [a, b] = m.images;
         let motion = poses[b].after(&poses[a].inverse());
         let in_one_place = norm(motion.translation) <= least;
         let in_front = in_one_place || meet(&m, &motion);
-        let focal = 0.5 * times * (looks[a].focal() + looks[b].focal());
+        let focal = 0.5 * times * (images[a].focal() + images[b].focal());
         if in_front { focal * offset(&m, &motion, in_one_place) } else { f64::INFINITY }
     };
     matches.iter().map(residual).collect()
 }
 
-/// The distance of a match from the place or line where a static scene has it, pixels of the small image.
-pub(super) fn distance(m: &Match, looks: &[SmallImage], poses: &[Se3]) -> f64 {
-    let [a, b] = m.looks;
+/// The distance of a match from its position or epipolar line in a static scene, pixels of the small image.
+pub(super) fn distance(m: &Match, images: &[SmallImage], poses: &[Se3]) -> f64 {
+    let [a, b] = m.images;
     let motion = poses[b].after(&poses[a].inverse());
     let centers = [a, b].map(|k| norm(poses[k].inverse().translation));
     let baseline = norm(motion.translation);
     let in_one_place = baseline <= ONE_PLACE * (centers[0] + centers[1] + baseline);
-    0.5 * (looks[a].focal() + looks[b].focal()) * offset(m, &motion, in_one_place)
+    0.5 * (images[a].focal() + images[b].focal()) * offset(m, &motion, in_one_place)
 }
 
 /// The Sampson distance of a match from its epipolar line, or of the turned ray where the cameras have the same
@@ -187,23 +188,23 @@ fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
 }
 
 /// Whether two rays meet, in front of both cameras.
-fn fits(m: &Match, looks: &[SmallImage], poses: &[Se3], least: f64) -> bool {
-    let [a, b] = m.looks;
+fn fits(m: &Match, images: &[SmallImage], poses: &[Se3], least: f64) -> bool {
+    let [a, b] = m.images;
     let motion = poses[b].after(&poses[a].inverse());
-    let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
+    let tolerance = NEAR * 2.0 / (images[a].focal() + images[b].focal());
     let in_one_place = norm(motion.translation) <= least;
     let near = offset(m, &motion, in_one_place) <= tolerance;
     near && (in_one_place || meet(m, &motion))
 }
 
-/// Whether the rays of cameras in two places meet in front of both, where they say so.
+/// Whether the rays of cameras in two places meet in front of both, where that can be determined.
 fn meet(m: &Match, motion: &Se3) -> bool {
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let t = normalize(motion.translation);
     let (from, to) = (normalize(mat_vec(&motion.rotation, p)), normalize(q));
     let normal = cross(from, to);
     if norm(normal) < PARALLEL {
-        // Far away, or along the baseline: both look the same way at least.
+        // Far away, or along the baseline: both have at least the same direction.
         return dot(from, to) > 0.0;
     }
     // t + s·from = r·to, in the plane of the rays.

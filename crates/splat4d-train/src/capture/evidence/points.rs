@@ -1,4 +1,5 @@
-//! Initial points: which part is in front of the cameras and in their images, and whether their colours are those there.
+//! Initial points: which part is in front of the cameras and in their images, and whether their colours are those
+//! there.
 
 use super::super::account::Severity;
 use super::super::lens::Distortion;
@@ -12,23 +13,24 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
 use std::collections::BTreeSet;
 
-/// Cameras and points that are asked, at most, evenly chosen.
+/// Cameras and points that are sampled, at most, evenly chosen.
 const CAMERAS: usize = 24;
 const POINTS: usize = 400;
 /// Share of points in images, and gain of colours, from which poses are right.
 pub(super) const CONVINCES: (f64, f64) = (0.03, MISFIT);
-/// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged images of
-/// one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
+/// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged
+/// images of one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
 const MISFIT: f64 = 0.2;
 const MANY: usize = 200;
-/// Share of points in images below which, of that many points, they are of another place.
+/// Share of points in images below which, of that many points, they are of another scene.
 const APART: f64 = 0.05;
 const FEW: usize = 100;
 /// Share of points that another convention shows at least, and how many times that of the poses as read.
 const SHOWN: (f64, f64) = (0.25, 4.0);
-/// The same without colours that say anything.
+/// The same without informative colours.
 const ALONE: f64 = 10.0;
-/// By how much another convention's colours fit better at least, where points in images already say so; else alone.
+/// By how much another convention's colours fit better at least, where points in images already indicate it; else
+/// alone.
 pub(super) const BETTER: f64 = 0.05;
 const COLOURS_ALONE: f64 = 0.15;
 /// Sum of the differences of three channels below which colours are one.
@@ -36,10 +38,10 @@ const ONE_COLOUR: f64 = 0.02;
 /// Colours that are compared at least.
 const ENOUGH: usize = 60;
 
-/// What points say of one convention.
+/// Evidence of points for one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
-    /// Points that were asked.
+    /// Points that were sampled.
     pub(super) asked: usize,
     /// Part of (camera, point) in front and inside.
     pub(super) seen: f64,
@@ -50,7 +52,7 @@ pub(super) struct Measure {
 }
 
 impl Measure {
-    /// The finding where points fit neither poses nor images. `None`: nothing speaks against them.
+    /// The finding where points fit neither poses nor images. `None`: there is no evidence against them.
     pub(super) fn doubt(&self, pairs: &pairs::Measure) -> Option<Finding> {
         if self.asked > 0 && self.seen == 0.0 {
             return Some(self.elsewhere());
@@ -107,17 +109,17 @@ impl Measure {
     }
 }
 
-/// The training frames whose cameras are asked.
+/// The training frames whose cameras are sampled.
 pub(super) fn frames(capture: &Capture) -> Vec<usize> {
     let step = capture.train.len().div_ceil(CAMERAS).max(1);
     capture.train.iter().step_by(step).copied().collect()
 }
 
-/// Measures one convention: `spread` are frames with their poses in it, `looks` images with theirs.
+/// Measures one convention: `spread` are frames with their poses in it, `images` are images with theirs.
 pub(super) fn measure(
     capture: &Capture,
     (frames, poses): (&[usize], &[Se3]),
-    (looks, look_poses): (&[SmallImage], &[Se3]),
+    (images, look_poses): (&[SmallImage], &[Se3]),
 ) -> Measure {
     let Some(cloud) = &capture.points else { return Measure::default() };
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
@@ -128,11 +130,11 @@ pub(super) fn measure(
         seen += chosen.iter().filter(|&&p| pixel_of(camera, &lens, pose, cloud.points[p]).is_some()).count();
     }
     let share = seen as f64 / (chosen.len() * frames.len()).max(1) as f64;
-    let (gain, compared) = gain(capture, &chosen, looks, look_poses, Trial::AS_READ).unzip();
+    let (gain, compared) = gain(capture, &chosen, images, look_poses, Trial::AS_READ).unzip();
     Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
 }
 
-/// Every how many points one is asked.
+/// Stride of the sampled points.
 fn step(cloud: &PointCloud) -> usize {
     cloud.points.len().div_ceil(POINTS).max(1)
 }
@@ -144,8 +146,8 @@ fn in_image<'a>(frame: &Frame, points: impl Iterator<Item = &'a [f64; 3]>) -> Ve
     points.filter_map(|&p| Some((pixel_of(camera, &lens, pose, p)?, pose.apply(p)[2]))).collect()
 }
 
-/// Part of the points that a camera has in its image in the middle, from which one that has none is remarkable, and part of the
-/// cameras that have none at most.
+/// Part of the points that a camera has in its image in the middle, from which one that has none is remarkable, and
+/// part of the cameras that have none at most.
 const USUAL: f64 = 0.1;
 const EXCEPTIONS: f64 = 0.2;
 
@@ -184,7 +186,7 @@ fn with_depth(capture: &Capture) -> Vec<&Frame> {
     frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect()
 }
 
-/// How many times as far away points are as metric depth maps say, and a map's file. `None`: undetermined.
+/// How many times as far away points are as metric depth maps indicate, and a map's file. `None`: undetermined.
 fn by_points(capture: &Capture) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let mut ratios = Vec::new();
@@ -204,24 +206,24 @@ fn by_points(capture: &Capture) -> Option<f64> {
     (quarter(3) <= STEADY * quarter(1)).then(|| quarter(2))
 }
 
-/// What a stored number of depth may have to be multiplied by: powers of two and ten over this range.
+/// Candidate factors of stored depths: powers of two and ten over this range.
 const FACTORS: [f64; 2] = [1e-5, 1e5];
 /// Pixels of a map that another map is compared with, along each side.
 const GRID: usize = 24;
-/// Two maps agree at a pixel within this share of the depth; and how many pixels agree in one unit, of those that both show, and how
-/// many times as many as in another.
+/// Two maps agree at a pixel within this share of the depth; and how many pixels agree in one unit, of those that both
+/// show, and how many times as many as in another.
 const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
-/// What is looked up in a depth map: pixels, and for each the unit that asks and the depth that it expects.
-struct Asked<'a> {
+/// Lookups in a depth map: pixels, and for each the querying unit and its expected depth.
+struct DepthLookup<'a> {
     frame: &'a Frame,
     pixels: Vec<[f64; 2]>,
     expected: Vec<(usize, f64)>,
 }
 
-/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several. Factors
-/// next to 1 are within what is right.
+/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with
+/// several. Factors next to 1 are within what is right.
 fn by_views(capture: &Capture) -> Option<f64> {
     let metric = |i: &&usize| capture.frames[**i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
     let all: Vec<usize> = capture.train.iter().filter(metric).copied().collect();
@@ -258,13 +260,14 @@ fn by_views(capture: &Capture) -> Option<f64> {
         factors.extend([power, 2.0 * power, 5.0 * power].into_iter().filter(|f| f.max(1.0 / f) >= SAME_UNIT));
         power *= 10.0;
     }
-    // By map: pixels that any unit asks for, with the unit and the depth that it expects there. Every map is decoded once.
-    let mut asked: Vec<Asked<'_>> = Vec::new();
+    // By map: pixels that any unit requests, with the unit and the depth that it expects there. Every map is decoded
+    // once.
+    let mut asked: Vec<DepthLookup<'_>> = Vec::new();
     for (frame, other, ray) in &samples {
         let (camera, pose) = (&other.source, &other.source.cam_from_world);
         let (lens, world_from_cam) = (Distortion::new(camera.lens), frame.source.cam_from_world.inverse());
         let at = asked.iter().position(|a| std::ptr::eq(a.frame, *other)).unwrap_or_else(|| {
-            asked.push(Asked { frame: other, pixels: Vec::new(), expected: Vec::new() });
+            asked.push(DepthLookup { frame: other, pixels: Vec::new(), expected: Vec::new() });
             asked.len() - 1
         });
         for (unit, factor) in factors.iter().enumerate() {
@@ -276,7 +279,7 @@ fn by_views(capture: &Capture) -> Option<f64> {
         }
     }
     let mut counts = vec![(0u32, 0u32); factors.len()];
-    for Asked { frame, pixels, expected } in asked {
+    for DepthLookup { frame, pixels, expected } in asked {
         let Some(Ok(depths)) = frame.depth.as_ref().map(|d| depth::at(d, &frame.source, &pixels)) else { continue };
         for (d, (unit, z)) in depths.iter().zip(expected).filter(|(d, _)| **d > 0.0) {
             counts[unit].0 += u32::from((z / f64::from(*d) - 1.0).abs() <= AGREE);
@@ -300,11 +303,11 @@ fn by_views(capture: &Capture) -> Option<f64> {
     }
 }
 
-/// What is known of the unit of metric depth maps.
+/// Findings about the unit of metric depth maps.
 pub(super) enum Unit<'a> {
     /// There are no such maps, or it is right.
     Right,
-    /// How many times as far away things are as they say, the evidence, and a map's file.
+    /// Ratio of true to stated depths, the evidence, and a map's file.
     Wrong(f64, &'static str, &'a DepthFile),
     /// Neither points nor other maps determine it.
     Unknown,
@@ -330,15 +333,15 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 }
 
 /// How much nearer colours of some points are to the images there than to those at other points.
-pub(super) fn gain_of(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    gain_if(capture, looks, poses, Trial::AS_READ)
+pub(super) fn gain_of(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
+    gain_if(capture, images, poses, Trial::AS_READ)
 }
 
 /// The same with other intrinsics.
-pub(super) fn gain_if(capture: &Capture, looks: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
+pub(super) fn gain_if(capture: &Capture, images: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
-    gain(capture, &chosen, looks, poses, trial).map(|(gain, _)| gain)
+    gain(capture, &chosen, images, poses, trial).map(|(gain, _)| gain)
 }
 
 /// How much nearer colours are to the image there than to that at other points, and how many were compared, with
@@ -346,19 +349,19 @@ pub(super) fn gain_if(capture: &Capture, looks: &[SmallImage], poses: &[Se3], tr
 fn gain(
     capture: &Capture,
     chosen: &[usize],
-    looks: &[SmallImage],
+    images: &[SmallImage],
     poses: &[Se3],
     trial: Trial,
 ) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
-    // Points of one colour, such as those that have none, say nothing.
+    // Points of one colour, such as those that have none, carry no information.
     let first = chosen.first().map(|&p| cloud.colors[p])?;
     if chosen.iter().all(|&p| apart(&cloud.colors[p], &first) < ONE_COLOUR) {
         return None;
     }
-    for (look, pose) in looks.iter().zip(poses) {
+    for (look, pose) in images.iter().zip(poses) {
         let camera = look.tried(trial);
         let there = |p: usize| look.color_of(&camera, pose, cloud.points[p]);
         let pairs: Vec<([f32; 3], [f32; 3])> =
@@ -379,7 +382,7 @@ fn gain(
     (count >= ENOUGH && other > 1e-3 * count as f64).then(|| (1.0 - own / other, count))
 }
 
-/// Whether points say that poses are written in the convention of `m`, and not as `stated`.
+/// Whether points indicate that poses are written in the convention of `m`, and not as `stated`.
 pub(super) fn prefers(m: &Measure, stated: &Measure, pairs: &pairs::Measure) -> bool {
     if m.asked == 0 || pairs.contradicts() {
         return false;

@@ -7,9 +7,10 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Images with a foreground that are needed.
 const ENOUGH: usize = 4;
-/// Angle between the ray to a foreground's middle and the common place, radians: things move, and are seen from other sides.
+/// Angle between the ray to a foreground's middle and the common position, radians: objects move, and are seen from
+/// other sides.
 const WITHIN: f64 = 0.2;
-/// Of the cameras' spread: what is nearer is no place in front of a camera.
+/// Of the cameras' spread: nearer positions are not in front of a camera.
 const CLOSE: f64 = 0.05;
 /// Part of the images from which poses are right, and below which another convention may be.
 pub(super) const CONVINCES: f64 = 0.7;
@@ -17,33 +18,33 @@ const DOUBTFUL: f64 = 0.35;
 
 /// Masks that show at least this share of the pixels along the edges of images hide something inside them.
 const EDGE: f64 = 0.9;
-/// Part of the images whose hidden part is at one place, from which masks are inverted: foregrounds of good captures are at one
-/// place in 70 % and more.
+/// Part of the images whose hidden part is at one place, from which masks are inverted: foregrounds of good captures
+/// are at one place in 70 % and more.
 const INVERTED: f64 = 0.8;
-/// Angle between a camera's axis and what it was pointed at, radians: in the middle half of usual fields of view.
+/// Angle between a camera's axis and its target, radians: in the middle half of usual fields of view.
 const AIMED: f64 = 0.35;
 /// Mean difference of two masks below which they are one: they hide a part of the camera, such as its own mount.
 const ONE_MASK: f64 = 0.01;
 
-/// Part of the images whose foreground is at the place that is nearest to all; `None`: too few have one.
-pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    at_one_place(looks, poses, |look| look.foreground).map(|(share, _)| share)
+/// Part of the images whose foreground is at the position that is nearest to all; `None`: too few have one.
+pub(super) fn measure(images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
+    at_one_place(images, poses, |look| look.foreground).map(|(share, _)| share)
 }
 
-/// What masks say of themselves: white counts.
+/// Polarity of masks: white counts.
 pub(super) enum Masks {
     /// There are none, or foregrounds are at one place.
     Fine,
-    /// What they hide is at the place that cameras look at: part of the images, share of what is shown, and of the edges.
+    /// The hidden parts are where the cameras point: part of the images, share of what is shown, and of the edges.
     Inverted(f64, f64, f64),
     /// Neither: images with masks that were examined, and the share of what is shown.
     Unsure(usize, f64),
 }
 
-/// Whether masks or alpha hide what cameras look at, and show what is around it.
-pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
-    let shown: Vec<&Shown> = looks.iter().filter_map(|l| l.shown.as_ref()).collect();
-    if shown.is_empty() || measure(looks, poses).is_some_and(|share| share >= CONVINCES) {
+/// Whether masks or alpha hide the cameras' target and show its surroundings.
+pub(super) fn masks(images: &[SmallImage], poses: &[Se3]) -> Masks {
+    let shown: Vec<&Shown> = images.iter().filter_map(|l| l.shown.as_ref()).collect();
+    if shown.is_empty() || measure(images, poses).is_some_and(|share| share >= CONVINCES) {
         return Masks::Fine;
     }
     let mean = |of: fn(&Shown) -> f64| shown.iter().map(|s| of(s)).sum::<f64>() / shown.len() as f64;
@@ -54,7 +55,7 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
         let apart = s.weights.iter().zip(first).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
         s.weights.len() != first.len() || apart > ONE_MASK * first.len() as f64
     };
-    match at_one_place(looks, poses, |look| look.hidden) {
+    match at_one_place(images, poses, |look| look.hidden) {
         Some((part, aimed)) if part >= INVERTED && aimed <= AIMED && of_edge >= EDGE && shown.iter().any(differs) => {
             Masks::Inverted(part, share, of_edge)
         }
@@ -62,15 +63,15 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
     }
 }
 
-/// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and the
-/// cameras' axes, radians; `None`: too few have it.
+/// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and
+/// the cameras' axes, radians; `None`: too few meet it.
 fn at_one_place(
-    looks: &[SmallImage],
+    images: &[SmallImage],
     poses: &[Se3],
     what: impl Fn(&SmallImage) -> Option<[f64; 2]>,
 ) -> Option<(f64, f64)> {
     let mut rays = Vec::new();
-    for (look, pose) in looks.iter().zip(poses) {
+    for (look, pose) in images.iter().zip(poses) {
         let Some([x, y]) = what(look) else { continue };
         let back = pose.inverse();
         let center = back.translation;
@@ -108,7 +109,7 @@ fn at_one_place(
     Some((rays.iter().filter(sees).count() as f64 / rays.len() as f64, aimed))
 }
 
-/// Whether foregrounds say that poses are written in the convention of `m`.
+/// Whether foregrounds indicate that poses are written in the convention of `m`.
 pub(super) fn prefers(m: Option<f64>, stated: Option<f64>) -> bool {
     m.zip(stated).is_some_and(|(m, stated)| m >= CONVINCES && stated <= DOUBTFUL)
 }

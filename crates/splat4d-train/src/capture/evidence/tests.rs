@@ -131,7 +131,7 @@ fn apart(poses: &[Se3]) -> f64 {
     (0..poses.len()).map(one).fold(0.0, f64::max)
 }
 
-/// The capture as if its files were of another layout and written as `poses` say.
+/// The capture as if its files were of another layout and written as `poses` specify.
 fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
     let mut out = Capture { convention: stated, ..capture.clone() };
     for (i, frame) in out.frames.iter_mut().enumerate() {
@@ -142,11 +142,11 @@ fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
 
 /// Conventions that are named right, of how many, and how many are named that are right.
 fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
-    let mut looks = look::take(capture, &capture.looked_at(), look::COARSE);
+    let mut images = look::take(capture, &capture.looked_at(), look::COARSE);
     let mut matches = None;
     let (mut right, mut all) = (0, 0);
     for &stated in conventions {
-        let good = misread(capture, stated, Poses::STATED).judge(&mut looks, &mut matches);
+        let good = misread(capture, stated, Poses::STATED).judge(&mut images, &mut matches);
         assert_eq!(good.written_as, None, "{stated:?}: {}", good.finding.what);
         assert_eq!(good.finding.severity, Severity::Note);
         assert!(good.finding.what.contains("agree"), "{}", good.finding.what);
@@ -158,7 +158,7 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
                 continue;
             }
             all += 1;
-            let verdict = wrong.judge(&mut looks, &mut matches);
+            let verdict = wrong.judge(&mut images, &mut matches);
             let Some(found) = verdict.written_as else {
                 eprintln!("{stated:?} {poses}: {}", verdict.finding.what);
                 continue;
@@ -175,7 +175,7 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
     (right, all)
 }
 
-/// A film of the scene by one camera that moves; `speed`: the ball turns by so many radians from frame to frame.
+/// A film of the scene by one camera that moves; `speed`: the ball turns by this many radians from frame to frame.
 fn film(speed: f64) -> (Sample, Capture) {
     const FRAMES: usize = 13;
     let sample = Sample::new(&["transforms.json"]);
@@ -243,21 +243,21 @@ fn conventions_are_named_by_foregrounds() {
     let (_sample, mut capture) = capture(false, true);
     // What is seen of the ball alone by cameras far apart has no features in common.
     capture.train.retain(|i| i % 2 == 1);
-    let mut looks = look::take(&capture, &capture.looked_at(), look::COARSE);
+    let mut images = look::take(&capture, &capture.looked_at(), look::COARSE);
     let flipped: Poses = "opencv".parse().unwrap();
     let wrong = misread(&capture, Convention::NERF, flipped);
-    assert_eq!(wrong.judge(&mut looks, &mut Some(Vec::new())).written_as, Some(flipped));
-    let right = misread(&capture, Convention::NERF, Poses::STATED).judge(&mut looks, &mut Some(Vec::new()));
+    assert_eq!(wrong.judge(&mut images, &mut Some(Vec::new())).written_as, Some(flipped));
+    let right = misread(&capture, Convention::NERF, Poses::STATED).judge(&mut images, &mut Some(Vec::new()));
     assert!(right.written_as.is_none() && right.finding.what.contains("foregrounds"), "{}", right.finding.what);
 }
 
 #[test]
 fn a_fixed_camera_is_no_evidence_for_its_pose() {
     let capture = photos(false);
-    let mut looks = look::take(&capture, &[0, 1, 1], look::COARSE);
-    look::describe(&mut looks, look::COARSE);
-    let matches = pairs::matches(&looks);
-    assert!(matches.len() > 20 && matches.iter().all(|m| m.looks()[0] == 0), "features agree with themselves");
+    let mut images = look::take(&capture, &[0, 1, 1], look::COARSE);
+    look::describe(&mut images, look::COARSE);
+    let matches = pairs::matches(&images);
+    assert!(matches.len() > 20 && matches.iter().all(|m| m.images()[0] == 0), "features agree with themselves");
 }
 
 #[test]
@@ -327,7 +327,7 @@ fn depth_maps_in_another_unit_are_named() {
     }
     let found = capture.check_points();
     assert!(found.len() == 1 && found[0].what.contains("initial points do not fit: these are 1.000e-3"), "{found:?}");
-    // Without points, maps of other views say the same.
+    // Without points, maps of other views give the same result.
     let points = capture.points.take();
     let found = capture.check_points();
     assert!(found.len() == 1 && found[0].what.contains("depth maps of other views do not fit"), "{found:?}");
@@ -342,7 +342,7 @@ fn depth_maps_in_another_unit_are_named() {
     assert!(found.len() == 1 && found[0].what.contains("8 bits"), "{found:?}");
 }
 
-/// What images say of single poses, focal lengths and masks: warnings.
+/// What images show about single poses, focal lengths and masks: warnings.
 fn warned(capture: &Capture) -> Vec<String> {
     let check = capture.check_poses();
     let all = check.more.into_iter().chain([check.finding]);

@@ -1,9 +1,9 @@
 //! Agisoft Metashape's `cameras.xml` (File, Export, Export Cameras, Agisoft XML).
 //!
-//! A camera's `transform` takes its axes (x right, y down, z forward) to the chunk's; that of the chunk or component takes
-//! those to the world, with a scale. Calibrations: f in pixels; cx, cy from the image's middle; Brown's terms with p1 and p2
-//! the other way round than OpenCV has them; b1 added to f across. Source: Metashape Professional user manual, "Camera
-//! models", and Agisoft's description of the format.
+//! A camera's `transform` takes its axes (x right, y down, z forward) to the chunk's; that of the chunk or component
+//! takes those to the world, with a scale. Calibrations: f in pixels; cx, cy from the image's middle; Brown's terms
+//! with p1 and p2 in the opposite order to OpenCV; b1 added to f across. Source: Metashape Professional user manual,
+//! "Camera models", and Agisoft's description of the format.
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take, without_pose};
 use crate::capture::{CaptureKind, CaptureOptions, RawCapture, json, panorama, pose, rig};
@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 
 pub(super) const EXPORT: Export = Export { find, is, read };
 
-/// The usual name; others are looked into.
+/// The usual name; other names are examined.
 const NAME: &str = "cameras.xml";
 /// Skew that is not reported, pixels.
 const MAX_SKEW: f64 = 0.5;

@@ -1,8 +1,8 @@
 //! Camera parameters of RealityScan (RealityCapture) as CSV: "Internal/External camera parameters".
 //!
-//! A line per image: name, position, heading, pitch and roll in degrees, the focal length and the principal point's distance
-//! from the middle for a film 36 mm wide, Brown's terms. The world has z up. Source: the columns and conventions as
-//! Nerfstudio's documentation of its RealityCapture import describes them.
+//! A line per image: name, position, heading, pitch and roll in degrees, the focal length and the principal point's
+//! distance from the middle for a film 36 mm wide, Brown's terms. The world has z up. Source: the columns and
+//! conventions as Nerfstudio's documentation of its RealityCapture import describes them.
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take};
 use crate::capture::{CaptureKind, CaptureOptions, RawCapture, json, picture, pose, rig};
@@ -37,7 +37,7 @@ fn is(path: &Path) -> bool {
     read && COLUMNS.iter().all(|c| columns.contains_key(*c))
 }
 
-/// What separates the cells: spreadsheets of countries with decimal commas write semicolons or tabs.
+/// Separators of cells: spreadsheets of countries with decimal commas write semicolons or tabs.
 fn separator(header: &str) -> char {
     [';', '\t'].into_iter().find(|c| header.contains(*c)).unwrap_or(',')
 }

@@ -2,8 +2,8 @@
 //! (`metadata`, `rgbd/0.jpg` …), whose depth is not read.
 //!
 //! `poses` are quaternions x y z w and centres, camera to world in ARKit's axes (y up; x right, y up, z backward in the
-//! camera), one an image; `K` is column-major; `perFrameIntrinsicCoeffs` are fx fy cx cy of each image. It is the film of one
-//! moving camera. Source: record3d's documentation of its formats.
+//! camera), one an image; `K` is column-major; `perFrameIntrinsicCoeffs` are fx fy cx cy of each image. It is the film
+//! of one moving camera. Source: record3d's documentation of its formats.
 
 use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
@@ -19,7 +19,7 @@ pub(super) const EXPORT: Export = Export { find, is, read };
 const NAMES: [&str; 2] = ["metadata.json", "metadata"];
 /// Folders of images.
 const FOLDERS: [&str; 3] = ["rgb", "rgbd", "color"];
-/// Frames a second where the file does not say.
+/// Frames per second where the file does not state it.
 const FPS: f64 = 60.0;
 const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
 

@@ -1,4 +1,4 @@
-//! Synthetic samples of every export; their poses come back as they were made.
+//! Synthetic samples of every export; their poses round-trip.
 
 use crate::capture::tests::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
 use crate::capture::{Capture, CaptureKind, CaptureOptions, Timing};
@@ -41,7 +41,7 @@ fn arkit(i: usize) -> Se3 {
     p
 }
 
-/// The end of the name of the one image that is said to be missing, and is skipped.
+/// The end of the name of the one image that is declared missing, and is skipped.
 fn one_missing(sample: &Sample) -> String {
     let capture = open(sample);
     assert_eq!(capture.frames.len(), COUNT - 1);
@@ -55,7 +55,7 @@ fn images(sample: &Sample, name: impl Fn(usize) -> String) {
 }
 
 #[test]
-fn metashape_cameras_come_back() {
+fn metashape_cameras_round_trip() {
     let sample = Sample::new(&["cameras.xml"]);
     images(&sample, |i| format!("images/IMG_{:04}.png", 7 * i + i));
     // The chunk is elsewhere, turned and twice as large.
@@ -119,7 +119,7 @@ fn metashape_cameras_come_back() {
 }
 
 #[test]
-fn realityscan_cameras_come_back() {
+fn realityscan_cameras_round_trip() {
     let sample = Sample::new(&["cameras.csv"]);
     images(&sample, |i| format!("DSC{i:05}.png"));
     let mut csv = "\u{feff}#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n".to_owned();
@@ -156,7 +156,7 @@ fn realityscan_cameras_come_back() {
 }
 
 #[test]
-fn polycam_keyframes_come_back() {
+fn polycam_keyframes_round_trip() {
     let sample = Sample::new(&[]);
     images(&sample, |i| format!("keyframes/images/17000{i:02}.png"));
     let camera = |i: usize| {
@@ -190,7 +190,7 @@ fn polycam_keyframes_come_back() {
 }
 
 #[test]
-fn record3d_recordings_come_back() {
+fn record3d_recordings_round_trip() {
     let sample = Sample::new(&["metadata.json"]);
     images(&sample, |i| format!("rgb/{i}.png"));
     let pose = |i: usize| {

@@ -12,7 +12,8 @@ use std::path::{Path, PathBuf};
 pub(in crate::capture) struct Twins(Vec<(PathBuf, PathBuf)>);
 
 impl Twins {
-    /// One image of each name, in their order. Errors: images of one name differ in size, so that which is meant decides.
+    /// One image of each name, in their order. Errors: images of one name differ in size, so that which is meant
+    /// decides.
     pub(in crate::capture) fn single(&mut self, images: Vec<PathBuf>) -> Result<Vec<PathBuf>> {
         let mut places: BTreeMap<(PathBuf, String), usize> = BTreeMap::new();
         let mut out: Vec<PathBuf> = Vec::with_capacity(images.len());
@@ -56,7 +57,7 @@ impl Twins {
         self.0.push((read, other));
     }
 
-    /// Says in one remark which images are not read.
+    /// Reports in one remark which images are not read.
     pub(in crate::capture) fn report(&self, root: &Path, account: &mut Account) {
         if let Some(what) = self.in_words(root) {
             account.add(Aspect::NotRead, Severity::Warning, what);

@@ -152,7 +152,7 @@ fn nerfstudio_maps_are_thousandths() {
 }
 
 #[test]
-fn what_is_no_depth_is_refused_by_file_and_frame() {
+fn invalid_depth_maps_are_refused_by_file_and_frame() {
     let message = |sample: &Sample| match load(sample, 1, 2) {
         Err(e) => e.to_string(),
         Ok(depth) => panic!("{depth:?} is read"),

@@ -90,7 +90,7 @@ fn flow_is_undistorted_with_its_image() {
 }
 
 #[test]
-fn what_is_no_flow_is_refused() {
+fn invalid_flow_is_refused() {
     let message = |sample: &Sample| match open(sample, 1) {
         Err(e) => e.to_string(),
         Ok(capture) => ImageStore::new(capture, 1 << 20).load(2).unwrap_err().to_string(),

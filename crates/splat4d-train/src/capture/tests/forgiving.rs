@@ -54,7 +54,7 @@ fn split_files_with_intrinsics_in_pixels() {
     assert!((k[2].fx - 12.0).abs() < 1e-12, "a frame's own angle goes before the file's pixels");
     assert!(matches!(capture.frames[0].source.lens, Lens::Brown { k, .. } if k[0] == -0.1));
     assert_eq!(capture.frames[1].source.lens, Lens::Pinhole);
-    // Blender's z is up only where Blender's angle stands for the lens.
+    // Blender's z is up only where Blender's angle represents the lens.
     assert!(capture.up != [0.0, 0.0, 1.0] && open(&samples::dnerf()).up == [0.0, 0.0, 1.0]);
     for (key, value, lens) in [("is_fisheye", json!(true), true), ("camera_model", json!("OPENCV_FISHEYE"), true)] {
         sample.edit("transforms_test.json", |v| v[key] = value);
@@ -203,7 +203,7 @@ fn numbered_frames_without_times_are_a_film() {
     let photos = open_as(&sample, Sequence::Photos);
     assert_eq!((photos.timing, photos.times(), photos.cameras.len()), (Timing::Moment, vec![0.0], 20));
     assert!(photos.warnings.is_empty());
-    // Given times are not in question.
+    // Given times are not in query.
     sample.edit("transforms.json", |v| (0..20).for_each(|c| v["frames"][c]["time"] = json!(0.1 * c as f64)));
     for sequence in [Sequence::Auto, Sequence::Photos] {
         let capture = open_as(&sample, sequence);

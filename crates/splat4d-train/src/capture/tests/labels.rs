@@ -47,7 +47,7 @@ fn mask_values_are_label_numbers_and_the_largest_is_unlabelled() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn invalid_labels_are_named() {
     let sample = sample();
     let say = |sample: &Sample| {
         let capture = match open(sample, 1) {

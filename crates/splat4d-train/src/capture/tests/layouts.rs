@@ -342,7 +342,7 @@ fn a_part_of_a_capture_equals_that_part_of_the_whole() {
             assert!(split(&some).iter().all(|&i| part.contains(&some.frames[i].index)));
         }
     }
-    // Of fixed cameras that are held out as a whole no more is listed than is asked for.
+    // Of fixed cameras that are held out as a whole no more is listed than is requested.
     let own = open_with(&samples::own(), CaptureOptions { frames: vec![part], ..CaptureOptions::default() });
     assert_eq!((own.frames.len(), own.take.pictures, own.take.frames), (3, 6, 0..2));
 }

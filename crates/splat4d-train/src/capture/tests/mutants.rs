@@ -1,5 +1,5 @@
-//! Mutated files: whatever a reader meets, it answers with a capture or an error; never a panic, a hang or a huge
-//! allocation. The corpus is a pure function of the seed.
+//! Mutated files: a reader returns a capture or an error; never a panic, a hang or a huge allocation. The corpus is a
+//! pure function of the seed.
 
 use super::super::*;
 use super::samples;

@@ -1,5 +1,5 @@
-//! One capture in many spellings: names, endings, byte-order marks, missing images, EXIF, splits, times, masks and standard
-//! folders. What is read is that of the capture as it was written, or an error; and never without a word.
+//! One capture in many spellings: names, endings, byte-order marks, missing images, EXIF, splits, times, masks and
+//! standard folders. The result equals the written capture, or is an error, never silently another.
 
 use super::super::*;
 use super::samples::{self, FOCAL, HEIGHT, PLY, Sample, WIDTH};
@@ -60,7 +60,7 @@ fn assert_same(name: &str, a: &Capture, b: &Capture) {
     }
 }
 
-/// Changes the names of images in the metadata of a sample, wherever they stand.
+/// Changes the names of images in the metadata of a sample, wherever they occur.
 fn rename_in_metadata(sample: &Sample, change: &dyn Fn(&str) -> String) {
     for file in &sample.files {
         if file.ends_with("images.txt") {
@@ -189,7 +189,7 @@ fn oriented(orientation: u8) -> Vec<u8> {
 fn orientations_follow_whose_pixels_the_poses_describe() {
     for orientation in 1..=8u8 {
         let turned = orientation > 1;
-        // COLMAP reads pixels as they are stored.
+        // COLMAP reads pixels as stored.
         let sample = samples::colmap_txt();
         sample.write("images/cam0/0000.png", &oriented(orientation));
         let capture = open(&sample);

@@ -35,7 +35,7 @@ pub(super) struct Rate {
     pub stated: bool,
 }
 
-/// What times count, the seconds of one, and why it is not sure.
+/// Unit of times, its seconds, and the reason for doubt.
 struct Reading {
     times: Times,
     scale: f64,
@@ -44,7 +44,8 @@ struct Reading {
     doubt: Option<String>,
 }
 
-/// Cameras, frame numbers and seconds where every frame has a time, and the frame rate. `None`: not every frame has one.
+/// Cameras, frame numbers and seconds where every frame has a time, and the frame rate. `None`: not every frame has
+/// one.
 pub(super) fn told(
     entries: &[Entry],
     rate: Rate,
@@ -91,7 +92,7 @@ fn is_frame(step: f64, fps: f64) -> bool {
     (step * fps - 1.0).abs() <= NEAR_STEP
 }
 
-/// What the times count.
+/// Unit of the times.
 fn read(
     entries: &[Entry],
     (times, instants, of_camera): (&[f64], &[f64], &[usize]),
@@ -169,7 +170,7 @@ fn read(
     of(Times::Seconds)
 }
 
-/// Says what times were read as, and how else they can be.
+/// Reports how times were read, and the alternatives.
 fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
     let [Some(first), Some(last)] = [instants.first(), instants.last()] else { return };
     if first == last {
@@ -227,8 +228,8 @@ fn crowded(entries: &[Entry], times: &[f64], of: &[usize]) -> bool {
     })
 }
 
-/// Frames that share a pose to the last bit come from one fixed camera, provided that there are clearly fewer poses than
-/// frames.
+/// Frames that share a pose to the last bit come from one fixed camera, provided that there are clearly fewer poses
+/// than frames.
 fn by_pose(entries: &[Entry]) -> Option<(Vec<String>, Vec<usize>)> {
     let key = |pose: &Se3| -> Vec<u64> {
         pose.rotation.iter().flatten().chain(&pose.translation).map(|v| v.to_bits()).collect()

@@ -1,4 +1,4 @@
-//! One frame of a transforms file: its image, pose, lens and time. What a frame states of itself goes before what the
+//! One frame of a transforms file: its image, pose, lens and time. Values of a frame have priority over those of the
 //! file states for all.
 
 use super::super::convention::{Convention, Poses};
@@ -14,21 +14,21 @@ use std::path::{Path, PathBuf};
 
 /// One entry of `frames`.
 pub(super) struct Entry {
-    /// `file_path` as it is written.
+    /// `file_path` as written.
     pub name: String,
     /// The image.
     pub image: PathBuf,
     /// Pose, intrinsics and lens.
     pub source: Camera,
-    /// Whether the focal length is an angle of view and no number of pixels: Blender's way.
+    /// Whether the focal length is an angle of view instead of pixels: Blender's way.
     pub by_angle: bool,
-    /// As it is written.
+    /// As written.
     pub time: Option<f64>,
     /// The mask.
     pub mask: Option<PathBuf>,
     /// The depth map.
     pub depth: Option<DepthFile>,
-    /// What it is for.
+    /// Its purpose.
     pub split: Split,
 }
 
@@ -36,11 +36,11 @@ pub(super) struct Entry {
 pub(super) struct File<'a> {
     /// Its folder, and how its files are found.
     pub lookup: &'a Lookup,
-    /// Where images are searched for.
+    /// Lookup of images.
     pub bases: &'a [PathBuf],
     /// The whole file.
     pub top: &'a Node<'a>,
-    /// What poses are written as.
+    /// Convention of the poses.
     pub poses: Poses,
     /// The size of an image that is there: that of missing ones where none is stated.
     pub size: Option<(usize, usize)>,
@@ -61,10 +61,10 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
-/// Nerfstudio's name for equirectangular panoramas, whose focal lengths say nothing.
+/// Nerfstudio's name for equirectangular panoramas, whose focal lengths carry no information.
 const PANORAMA: &str = "EQUIRECTANGULAR";
 
-/// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
+/// Scene units per stored number of a depth map where a file does not state it: thousandths, as in Nerfstudio.
 const DEPTH_UNIT: f64 = 1e-3;
 
 /// A depth map in units of `depth_unit_scale_factor`, whatever its kind of file (Nerfstudio).
@@ -123,7 +123,7 @@ fn number(top: &Node<'_>, node: &Node<'_>, key: &str) -> Result<Option<f64>> {
     value(top, node, key)?.map(|n| n.number()).transpose()
 }
 
-/// The size that the intrinsics are for: as it is stated, else the image's.
+/// The size that the intrinsics belong to: as stated, else the image's.
 fn size(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(usize, usize)> {
     let side = |key: &str| value(file.top, node, key)?.map(|n| n.count()).transpose();
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
@@ -140,8 +140,8 @@ fn size(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(usize, usize)
     picture::header(image).map(|header| header.upright())
 }
 
-/// The focal length along a side, pixels, and whether it comes from an angle of view. `keys`: pixels, radians, degrees
-/// (instant-ngp).
+/// The focal length along a side, pixels, and whether it is derived from an angle of view. `keys`: pixels, radians,
+/// degrees (instant-ngp).
 fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Result<Option<(f64, bool)>> {
     let [pixels, radians, degrees] = keys;
     for level in [node, top] {
@@ -165,7 +165,7 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
 /// By how much an angle of view and a focal length in pixels may differ: angles are sometimes of undistorted images.
 const SAME_FOCAL: f64 = 1.1;
 
-/// What to say where the file's angle of view is another than its focal length in pixels, which is the one that is read.
+/// The remark if the file's angle of view contradicts its focal length in pixels, which is the one that is read.
 pub(super) fn contradiction(top: &Node<'_>, entries: &[Entry]) -> Result<Option<String>> {
     let (Some(angle), Some(entry)) = (top.opt("camera_angle_x")?, entries.first()) else { return Ok(None) };
     let (angle, camera) = (angle.number()?, &entry.source);
@@ -293,7 +293,7 @@ const READ: &[&str] = &[
     "ply_file_path",
     "applied_transform",
 ];
-/// Keys that say nothing of poses, lenses and times: sizes of other programs' volumes, statistics, names.
+/// Keys that carry no information about poses, lenses and times: sizes of other programs' volumes, statistics, names.
 const HARMLESS: &[&str] = &[
     "aabb_scale",
     "aabb",

@@ -23,7 +23,7 @@ use splat4d::scene::LifeKind;
 use splat4d::scene::{BLOCK, Grads, SH, Space, Table, Time};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-/// Rates of fine-tuning fall to this share of themselves, so that numbers come to rest on one side of a rounding.
+/// Rates of fine-tuning fall to this share of themselves, so that numbers settle on one side of a rounding threshold.
 const FALL: f64 = 0.1;
 /// The palette's entries learn this much slower than base colours, as rows' own coefficients do (Kerbl et al. 2023).
 const SH_SLOWDOWN: f64 = 20.0;
@@ -40,18 +40,18 @@ pub(crate) struct Quantised {
 /// State kept from step to step.
 #[derive(Debug)]
 struct Memory {
-    /// One a layer: its rows' entries of the palette.
+    /// One per layer: its rows' entries of the palette.
     labels: Vec<Vec<u16>>,
-    /// One a layer: how important the page is, 0 the most.
+    /// One per layer: how important the page is, 0 the most.
     tiers: Vec<u16>,
     /// Spherical harmonics above degree 0; none: base colours only.
     shared: Option<Shared>,
-    /// One a layer: blocks of the file whose rows have changed since they were shown.
+    /// One per layer: blocks of the file whose rows have changed since they were shown.
     dirty: Vec<Vec<bool>>,
 }
 
 impl Quantised {
-    /// A codec of codes of so many bits; `rate`: how fast the palette learns. Errors: depths out of range.
+    /// A codec of codes of this many bits; `rate`: how fast the palette learns. Errors: depths out of range.
     pub(crate) fn new(depths: Depths, rate: Rate) -> Result<Arc<Self>> {
         depths.check()?;
         Ok(Arc::new(Self { coder: Coder { depths }, rate, memory: Mutex::new(None) }))
@@ -158,7 +158,7 @@ impl Codec<f32> for Quantised {
     }
 }
 
-/// Gives rows of wanted blocks of the file the coefficients above degree 0 of their entries.
+/// Gives rows of requested blocks of the file the coefficients above degree 0 of their entries.
 fn paint(table: &mut Table<f32>, labels: &[u16], palette: &Palette, wanted: &[bool]) {
     let chunks: Vec<_> = table.chunks_mut(BLOCK_GAUSSIANS / BLOCK).zip(wanted).filter(|(_, w)| **w).collect();
     chunks.into_par_iter().for_each(|(view, _)| {
@@ -177,14 +177,14 @@ pub(crate) fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
     groups.into_iter().map(|g| Group { rate: fall(g.rate), ..g }).collect()
 }
 
-/// The rate of a palette that goes with [`tuned`].
+/// The rate of a palette for [`tuned`].
 pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
     let rate = share * rates.feature * rates.decay / SH_SLOWDOWN;
     Rate { start: rate, end: FALL * rate }
 }
 
-/// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
-/// in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
+/// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a
+/// lifespan, in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
 pub(crate) fn stage(
     recipe: &Recipe,
     plan: &TrainContext,
@@ -195,7 +195,7 @@ pub(crate) fn stage(
     let rotates = recipe.program().is_ok_and(|p| p.capabilities(plan).rotates);
     let spacetime = SpacetimeSettings {
         order: 1,
-        // A turn that no model asked for would cost two bytes a Gaussian.
+        // A turn that no model requested would cost two bytes per Gaussian.
         rotation_rate: recipe.spacetime.rotation_rate || rotates,
         ..recipe.spacetime.clone()
     };
@@ -210,11 +210,11 @@ pub(crate) fn stage(
         name: "quantised".into(),
         iterations,
         groups: tuned(base.groups, share).into_iter().map(|g| Group { layer: EVERY, ..g }).collect(),
-        // Pages say with a width next to nothing that a life is a time.
+        // Pages encode a single time as a lifespan of nearly zero width.
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,
-        // Rows that came or went would leave the file's labels behind.
+        // Added or removed rows would not match the file's labels.
         maintenance: Vec::new(),
         codec: Some(codec),
         ..base

@@ -1,4 +1,4 @@
-//! The palette as it learns: entries in floats, their moments, and their codes.
+//! The learnable palette: entries in floats, their moments, and their codes.
 
 use crate::optim::Moments;
 use rayon::prelude::*;
@@ -26,7 +26,7 @@ pub(super) struct Shared {
 }
 
 impl Shared {
-    /// Starts with what a reader sees.
+    /// Starts with the decoded file.
     pub(super) fn new(palette: &Palette) -> Self {
         let mut new = Self::empty(palette.degree, palette.entries);
         let table = &mut new.params[KEY];
@@ -85,8 +85,8 @@ impl Shared {
         finite
     }
 
-    /// Sums the rows' gradients entry by entry: rows in order, one task a coefficient, so that the number of threads does
-    /// not matter. Returns whether there are any.
+    /// Sums the rows' gradients entry by entry: rows in order, one task a coefficient, so that the number of threads
+    /// does not matter. Returns whether there are any.
     pub(super) fn gather(&mut self, d: &[Grads<f32>], labels: &[Vec<u16>]) -> bool {
         let (entries, width) = (self.entries(), self.sums.len());
         let layers: Vec<_> = d.iter().zip(labels).filter(|(d, _)| d.touched(SH)).collect();

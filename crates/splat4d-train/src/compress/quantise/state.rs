@@ -69,6 +69,6 @@ impl<'a> Words<'a> {
 }
 
 fn damaged() -> Error {
-    Error::input("the checkpoint is damaged: its quantised scene does not hold together")
+    Error::input("the checkpoint is damaged: its quantised scene is inconsistent")
         .remedy("Delete it; the run continues from the one before")
 }

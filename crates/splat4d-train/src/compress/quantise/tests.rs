@@ -1,5 +1,5 @@
-//! Learning behind a codec: the same image as the file's, gradients past the rounding, a palette that is a sum, a
-//! memory that comes back.
+//! Learning behind a codec: the same image as the file's, gradients past the rounding, a palette that is a sum, a state
+//! that round-trips.
 
 use super::*;
 use crate::capture::frames::{Frames, Picture};
@@ -283,7 +283,7 @@ fn tuning_recovers_quality_lost_to_coarse_codes() {
 }
 
 #[test]
-fn memory_comes_back_and_damage_is_refused() {
+fn codec_state_round_trips_and_damage_is_refused() {
     let (codec, scene, pages) = begun(301, coarse());
     assert!(codec.learn(&mut gradients(&scene, Time(0.1), 3), 0.0, 1.0));
     let words = codec.state();

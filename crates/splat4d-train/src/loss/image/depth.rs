@@ -1,18 +1,19 @@
-//! Known depth: what a pixel shows is as far away as the capture's depth map states, as far as the map knows that.
+//! Known depth: the rendered depth of a pixel equals that of the capture's depth map, where the map has it.
 
-use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use super::{ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::capture::DepthKind;
 use crate::capture::frames::DepthTruth;
 use crate::loss::terms::StepInfo;
 use splat4d::math::{Real, median_by};
 use splat4d::scene::Planes;
 
-/// [`depth`] of views that know theirs, times a weight that falls to [`LAST`] of it by the end: a map that is wrong bends
-/// the scene early, and images decide in the end.
+/// [`depth`] of views that have depth, times a weight that falls to [`LAST`] of it by the end: a map that is wrong
+/// bends the scene early, and images decide in the end.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Depth(pub f64);
 
-/// Of the weight, what is left of it at the end of a stage (Kerbl et al. 2024 end at 0.01; ground truth deserves more than that).
+/// Of the weight, what is left of it at the end of a stage (Kerbl et al. 2024 end at 0.01; ground truth deserves more
+/// than that).
 const LAST: f64 = 0.1;
 
 impl<F: Real> ImageTerm<F> for Depth {
@@ -20,19 +21,19 @@ impl<F: Real> ImageTerm<F> for Depth {
         Needs { depth: view.depth.is_some(), extra: Vec::new() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.depth.is_some()
     }
 
-    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let Some(truth) = view.depth else { return 0.0 };
         let weight = self.0 * LAST.powf(info.progress);
         depth([shown.depth, shown.alpha], truth, weight, [d.depth.add(), d.alpha.add()])
     }
 }
 
-/// Errors below this cost their square: of a logarithm a hundredth of the distance; of standardised depth as much of its
-/// spread.
+/// Errors below this cost their square: of a logarithm a hundredth of the distance; of standardised depth as much of
+/// its spread.
 const SOFT: f64 = 0.01;
 /// Depth that varies by less than this share of its mean has no shape to compare.
 const FLAT: f64 = 1e-6;
@@ -46,11 +47,11 @@ fn charbonnier<F: Real>(e: F) -> (F, F) {
 
 /// Mean over pixels of known depth that show something of ρ(e), ρ the Charbonnier penalty, D = Σ z α T / A the expected
 /// depth. Metric: e = ln D − ln D*. Up to scale and shift: e is the difference of D (or 1/D) and the map, each less its
-/// mean and over its standard deviation in these pixels; exactly differentiated, since a scale and a shift that are fitted
-/// to the map and then held would reward a drawing without any shape. No unit.
+/// mean and over its standard deviation in these pixels; exactly differentiated, since a scale and a shift that are
+/// fitted to the map and then held would reward a rendering without any shape. No unit.
 ///
 /// Shapes: `pictures` Σ z α T and A, [1, h, w]; `d` adds up their gradients.
-/// Sources: Ranftl et al. 2020 (MiDaS) for what is free of scale and shift, with moments for medians; Li et al. 2021
+/// Sources: Ranftl et al. 2020 (MiDaS) for invariance to scale and shift, with moments for medians; Li et al. 2021
 /// (NSFF) for its use on moving scenes.
 pub(crate) fn depth<F: Real>(
     [depth, alpha]: [&Planes<F>; 2],
@@ -132,7 +133,7 @@ fn standardised<F: Real>(mut values: Vec<F>) -> Option<(Vec<F>, F)> {
     Some((values, F::of(spread)))
 }
 
-/// How far a drawn image's depth is from a map.
+/// How far a rendered image's depth is from a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Apart {
     /// Of a metric map: the median of D / D*, and the median of |D / D* − 1|.

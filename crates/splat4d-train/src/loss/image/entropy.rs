@@ -1,6 +1,6 @@
 //! Entropy of what is half there: opacities and masks that decide for one side.
 
-use super::{ImageTerm, PictureGrads, Shown, View};
+use super::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 pub(crate) struct MaskEntropy(pub f64);
 
 impl<F: Real> ImageTerm<F> for MaskEntropy {
-    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         mask_entropy(shown.alpha, self.0, d.alpha.add())
     }
 }

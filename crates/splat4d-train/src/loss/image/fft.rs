@@ -20,7 +20,7 @@ pub(super) struct Spectrum<F> {
 }
 
 impl<F: Real> Spectrum<F> {
-    /// Sizes the image and fills it with zeros. Panics: the side is no power of two.
+    /// Sizes the image and fills it with zeros. Panics: the side is not a power of two.
     pub(super) fn reset(&mut self, side: usize) {
         assert!(side.is_power_of_two() && side >= LANES, "sides are powers of two from {LANES} on, not {side}");
         if self.side != side {

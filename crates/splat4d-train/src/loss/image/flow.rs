@@ -1,11 +1,11 @@
-//! Flow and tracks: what a pixel shows goes where the truth states, by the next frame or by any other.
+//! Flow and tracks: the rendered displacement of a pixel equals the truth, to the next frame or to any other.
 
-use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
+use super::{Channel, ImageTerm, LossGrads, Needs, SEEN, Shown, View, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
 
-/// [`flow()`] of views that know theirs, times a weight.
+/// [`flow()`] of views that have flow, times a weight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Flow(pub f64);
 
@@ -14,11 +14,11 @@ impl<F: Real> ImageTerm<F> for Flow {
         Needs { depth: false, extra: view.flow.map(|_| Channel::Flow).into_iter().collect() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.flow.is_some()
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let (Some(truth), Some((first, drawn))) = (&view.flow, shown.channel(&Channel::Flow)) else { return 0.0 };
         let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
         let value = flow(&drawn, truth.vectors, self.0, &mut d_drawn);
@@ -27,7 +27,7 @@ impl<F: Real> ImageTerm<F> for Flow {
     }
 }
 
-/// [`tracks()`] of views that know some, times a weight.
+/// [`tracks()`] of views that have tracks, times a weight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tracks(pub f64);
 
@@ -36,11 +36,11 @@ impl<F: Real> ImageTerm<F> for Tracks {
         Needs { depth: false, extra: view.tracks.map(|_| Channel::Tracks).into_iter().collect() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.tracks.is_some()
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let (Some(truth), Some((first, drawn))) = (&view.tracks, shown.channel(&Channel::Tracks)) else { return 0.0 };
         let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
         let value = tracks(&drawn, truth.vectors, self.0, &mut d_drawn);
@@ -65,9 +65,9 @@ pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d
 const HUBER: f64 = 3.0;
 
 /// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the image's longer side, F as in
-/// [`flow`] but
-/// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). What the pixel shows is followed by
-/// the weights with which it is blended: the point is where these Gaussians are, and goes where they go.
+/// [`flow`] but to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). The surface
+/// at the pixel is followed by the weights with which it is blended: the point is where these Gaussians are, and moves
+/// with them.
 ///
 /// Shapes: as [`flow`]. Source: Wang et al. 2024 (Shape of Motion), track reprojection, with Huber's penalty.
 pub(crate) fn tracks<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {

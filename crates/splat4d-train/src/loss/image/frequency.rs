@@ -1,7 +1,7 @@
 //! Frequencies: amplitude and phase of the image's spectrum, coarse ones first.
 
 use super::fft::Spectrum;
-use super::{ImageTerm, PictureGrads, Shown, View};
+use super::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use rayon::prelude::*;
 use splat4d::math::Real;
@@ -22,13 +22,13 @@ impl<F: Real> FrequencyTerm<F> {
 }
 
 impl<F: Real> ImageTerm<F> for FrequencyTerm<F> {
-    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         self.frequency.loss_and_grad(shown.color, view.truth, info.progress, self.weight, d.color.add())
     }
 }
 
-/// The band begins at this share of the highest frequency and reaches all of it at [`FULL`]: fine detail is compared once
-/// coarse shape is there.
+/// The band begins at this share of the highest frequency and reaches all of it at [`FULL`]: fine detail is compared
+/// once coarse shape is there.
 const FIRST: f64 = 0.125;
 /// Share of the stage after which the band holds every frequency.
 const FULL: f64 = 0.75;
@@ -41,8 +41,8 @@ const SILENT: f64 = 1e-8;
 /// arc that
 /// it spans and its slope stays bounded where there is no amplitude.
 ///
-/// Source: Zhang et al. 2024, "FreGS", equations 5 to 9 (there phases count unweighted, and the band grows linearly too).
-/// Images are padded with zeros to the next power of two.
+/// Source: Zhang et al. 2024, "FreGS", equations 5 to 9 (there phases count unweighted, and the band grows linearly
+/// too). Images are padded with zeros to the next power of two.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Frequency<F> {
     spectrum: Spectrum<F>,
@@ -74,7 +74,7 @@ impl<F: Real> Frequency<F> {
         let scale = weight / (count * image.channels).max(1) as f64;
         let unit = 1.0 / ((w * h) as f64).sqrt();
         let mut value = 0.0;
-        // The gradients of two channels go back through one transform: what belongs to a real image is symmetric.
+        // The gradients of two channels are backpropagated by one transform: what belongs to a real image is symmetric.
         for pair in (0..image.channels).step_by(2) {
             self.grads.reset(side);
             for (part, c) in (pair..(pair + 2).min(image.channels)).enumerate() {

@@ -1,6 +1,6 @@
 //! Alpha against the foreground mask.
 
-use super::{ImageTerm, PictureGrads, Shown, View};
+use super::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 
@@ -9,7 +9,7 @@ use splat4d::math::Real;
 pub(crate) struct Mask(pub f64);
 
 impl<F: Real> ImageTerm<F> for Mask {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let Some(mask) = view.mask else { return 0.0 };
         let scale = F::of(self.0) / F::of(mask.pixels() as f64);
         let mut sum = 0.0f64;

@@ -1,8 +1,8 @@
 //! Losses on a rendered image, each an [`ImageTerm`]: photometric, total variation, frequencies, masks, entropy of
 //! alpha, agreement of depth and normals, known depth, flow.
 //!
-//! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
-//! of threads. `terms` is the list of those that a recipe asks for.
+//! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any
+//! number of threads. `terms` is the list of those that a recipe requests.
 
 pub(crate) mod depth;
 pub(crate) mod entropy;
@@ -17,7 +17,7 @@ mod term;
 mod tests;
 pub(crate) mod tv;
 
-pub use term::{Channel, Gradient, ImageTerm, LossValue, Needs, PictureGrads, Shown, View};
+pub use term::{Channel, Gradient, ImageTerm, LossGrads, LossValue, Needs, Shown, View};
 
 use super::{LossSettings, Photometric};
 use rayon::prelude::*;
@@ -26,8 +26,8 @@ use splat4d::math::Real;
 /// Alpha from which on a pixel shows something: below it depth, normal and flow are those of haze.
 pub(crate) const SEEN: f64 = 0.5;
 
-/// The terms that have a weight, in the order in which values and gradients are summed: colours as 3DGS compares them, then what
-/// has a weight.
+/// The terms that have a weight, in the order in which values and gradients are summed: colours as 3DGS compares them,
+/// then what has a weight.
 pub(crate) fn terms(settings: &LossSettings) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
     let weighted: [(f64, Make); 9] = [

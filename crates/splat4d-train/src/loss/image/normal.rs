@@ -1,6 +1,6 @@
-//! Agreement of depth and normals: splats lie flat on the surface that their depth draws.
+//! Agreement of depth and normals: splats are flat on the surface of their rendered depth.
 
-use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use super::{Channel, ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::math::vec3::{cross, dot};
@@ -15,8 +15,8 @@ impl<F: Real> ImageTerm<F> for DepthNormal {
         Needs { depth: true, extra: vec![Channel::Normals] }
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
-        let (first, normals) = shown.channel(&Channel::Normals).expect("normals are drawn where they are needed");
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
+        let (first, normals) = shown.channel(&Channel::Normals).expect("normals are rendered where they are needed");
         let mut d_normals = Planes::new(3, normals.height, normals.width);
         let pictures = [shown.depth, shown.alpha, &normals];
         let value = depth_normal(view.camera, pictures, self.0, [d.depth.add(), d.alpha.add(), &mut d_normals]);
@@ -28,9 +28,9 @@ impl<F: Real> ImageTerm<F> for DepthNormal {
 /// A cross product shorter than this share of the squared depth has no direction.
 const DEGENERATE: f64 = 1e-12;
 
-/// Mean over inner pixels that, with their four neighbours, show something of A − ⟨S, N⟩, A held constant: S = Σ α T n blends
-/// the splats' normals (their shortest axes, towards the camera, camera axes), N is the unit normal of the expected
-/// depth, from central differences of its points. No unit, in \[0, 2\].
+/// Mean over inner pixels that, with their four neighbours, show something of A − ⟨S, N⟩, A held constant: S = Σ α T n
+/// blends the splats' normals (their shortest axes, towards the camera, camera axes), N is the unit normal of the
+/// expected depth, from central differences of its points. No unit, in \[0, 2\].
 ///
 /// Shapes: `depth` (Σ z α T) and `alpha` [1, h, w], `normals` [3, h, w]. Adds to all three gradients.
 /// Source: Huang et al. 2024, "2D Gaussian Splatting", equation 14, with the shortest axis as a Gaussian's normal.

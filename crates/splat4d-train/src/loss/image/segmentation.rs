@@ -1,6 +1,6 @@
-//! Segmentation: a column of the Gaussians that states who is foreground, drawn and compared with the masks.
+//! Segmentation: a column of the Gaussians that states who is foreground, rendered and compared with the masks.
 
-use super::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
+use super::{Channel, ImageTerm, LossGrads, Needs, Shown, View};
 use crate::loss::photometric::Photometric;
 use crate::loss::terms::StepInfo;
 use splat4d::scene::Planes;
@@ -29,7 +29,7 @@ impl ImageTerm for Segmentation {
         Needs { depth: false, extra: view.mask.map(|_| self.channel.clone()).into_iter().collect() }
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let (Some(mask), Some((first, drawn))) = (view.mask, shown.channel(&self.channel)) else { return 0.0 };
         let value = self.photometric.loss_and_grad(&drawn, mask, view.weight, &mut self.d_shown);
         let weight = self.weight as f32;

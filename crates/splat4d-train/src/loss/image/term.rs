@@ -1,5 +1,5 @@
-//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, looks at an image and its
-//! truth, and adds its gradient.
+//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, compares an image and
+//! its truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
 use crate::loss::terms::StepInfo;
@@ -35,11 +35,11 @@ pub struct View<'a, F = f32> {
     pub mask: Option<&'a Planes<F>>,
     /// Pixels that count, 1 channel.
     pub weight: Option<&'a Planes<F>>,
-    /// How far away what it shows is, as far as that is known.
+    /// Its depth, where known.
     pub depth: Option<DepthTruth<'a, F>>,
-    /// Where its pixels go, as far as that is known.
+    /// Its optical flow, where known.
     pub flow: Option<FlowTruth<'a, F>>,
-    /// Where tracked points are at another time: flow that is known in their pixels alone.
+    /// Positions of tracked points at another time: flow that is known in their pixels alone.
     pub tracks: Option<FlowTruth<'a, F>>,
     /// The frame's number in the capture, for messages and for devices that keep its image.
     pub frame: usize,
@@ -48,18 +48,18 @@ pub struct View<'a, F = f32> {
 }
 
 /// A further channel: a number or a few of every splat, blended as colours are, over nothing. The declared order is the
-/// order in which they are drawn.
+/// order in which they are rendered.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Channel {
     /// Σ α T n, n the shortest axis of a splat towards the camera, camera axes, 3 planes.
     Normals,
-    /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T of
-    /// the splats that have an f. Only views that know their flow may ask for it.
+    /// Σ α T f, f the displacement of a splat's centre on the screen to the time of the view's flow, pixels, 2 planes,
+    /// and Σ α T of the splats that have an f. Only views with flow may request it.
     Flow,
-    /// The same for where the view's tracks go.
+    /// The same to the time of the view's tracks.
     Tracks,
-    /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not drawn where
-    /// no layer has it.
+    /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not
+    /// rendered if no layer has it.
     Sigmoid(String),
 }
 
@@ -72,7 +72,7 @@ impl Channel {
         }
     }
 
-    /// The other time at which it looks at the view's splats.
+    /// The other time at which it needs the view's splats.
     pub(crate) fn other_time<F: Copy>(&self, view: &View<'_, F>) -> Option<Time> {
         match self {
             Channel::Flow | Channel::Tracks => Some(self.way(view)?.to),
@@ -80,7 +80,7 @@ impl Channel {
         }
     }
 
-    /// What is known of the way that it draws.
+    /// Known motion of a channel to render.
     pub(crate) fn way<'a, F: Copy>(&self, view: &View<'a, F>) -> Option<FlowTruth<'a, F>> {
         match self {
             Channel::Flow => view.flow,
@@ -90,12 +90,12 @@ impl Channel {
     }
 }
 
-/// The planes to draw of a view next to colour and alpha.
+/// The planes to render of a view next to colour and alpha.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
     /// Σ z α T.
     pub depth: bool,
-    /// Further channels, in order, none twice.
+    /// Further channels, in order, without duplicates.
     pub extra: Vec<Channel>,
 }
 
@@ -125,12 +125,12 @@ pub struct Shown<'a, F = f32> {
 }
 
 impl<'a, F: Real> Shown<'a, F> {
-    /// A drawn image with these further channels.
+    /// A rendered image with these further channels.
     pub(crate) fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
         Self { color: &image.color, alpha: &image.alpha, depth: &image.depth, extra: &image.extra, channels }
     }
 
-    /// First plane of a channel, and a copy of its planes; `None`: it was not drawn.
+    /// First plane of a channel, and a copy of its planes; `None`: it was not rendered.
     pub fn channel(&self, channel: &Channel) -> Option<(usize, Planes<F>)> {
         let first = self.channels.iter().find(|(c, _)| c == channel)?.1;
         let (n, channels) = (self.extra.pixels(), channel.width());
@@ -174,7 +174,7 @@ impl<F: Real> Gradient<F> {
 
 /// The gradient to an image.
 #[derive(Clone, Debug, Default)]
-pub struct PictureGrads<F = f32> {
+pub struct LossGrads<F = f32> {
     /// To colour, [3, h, w].
     pub color: Gradient<F>,
     /// To alpha, [1, h, w].
@@ -185,7 +185,7 @@ pub struct PictureGrads<F = f32> {
     pub extra: Gradient<F>,
 }
 
-impl<F: Real> PictureGrads<F> {
+impl<F: Real> LossGrads<F> {
     /// Zeros in the shape of `image`.
     pub(crate) fn begin(&mut self, image: &Image<F>) {
         self.color.begin(&image.color);
@@ -220,13 +220,13 @@ pub trait ImageTerm<F: Real = f32>: Send {
         Needs::default()
     }
 
-    /// Whether it looks at this view: where it does not, its value is 0 and it adds no gradient.
-    fn looks_at(&self, _view: &View<'_, F>) -> bool {
+    /// Whether it applies to this view: if not, its value is 0 and it adds no gradient.
+    fn applies_to(&self, _view: &View<'_, F>) -> bool {
         true
     }
 
     /// Its value for one view; adds its gradient to `d`.
-    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64;
 
     /// The loss of a view as plain data, where it is that of 3DGS and nothing else: a device may then compute it.
     fn target<'a>(&self, _view: &View<'a, F>) -> Option<Target<'a, F>> {

@@ -52,7 +52,7 @@ fn the_gradient_of_a_list_is_the_sum_of_its_terms_in_any_order() {
     let (image, camera, truth) = (image(), camera(), check::planes("truth", [3, SIZE[0], SIZE[1]], 0.0, 1.0));
     let view = view(&camera, &truth, None);
     let run = |terms: &mut [&mut dyn ImageTerm<f64>]| {
-        let mut d = PictureGrads::default();
+        let mut d = LossGrads::default();
         d.begin(&image);
         let shown = Shown::new(&image, &[]);
         let value: f64 = terms.iter_mut().map(|t| t.eval(&info(), &view, &shown, &mut d)).sum();
@@ -79,7 +79,7 @@ fn the_mask_pulls_alpha_where_there_is_a_mask() {
     let mut mask = Planes::new(1, SIZE[0], SIZE[1]);
     mask.data.iter_mut().enumerate().for_each(|(i, m)| *m = f64::from(u8::from(i % 3 > 0)));
     let run = |alpha: &Planes<f64>, d_alpha: &mut Planes<f64>, mask: Option<&Planes<f64>>| {
-        let (image, mut d) = (Image { alpha: alpha.clone(), ..image.clone() }, PictureGrads::default());
+        let (image, mut d) = (Image { alpha: alpha.clone(), ..image.clone() }, LossGrads::default());
         d.begin(&image);
         let value = mask::Mask(0.4).eval(&info(), &view(&camera, &truth, mask), &Shown::new(&image, &[]), &mut d);
         d.alpha.add().data.iter().zip(&mut d_alpha.data).for_each(|(from, to)| *to += from);

@@ -1,6 +1,6 @@
 //! Total variation: images and depths without speckle.
 
-use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use super::{ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 pub(crate) struct TotalVariation(pub f64);
 
 impl<F: Real> ImageTerm<F> for TotalVariation {
-    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         total_variation(shown.color, self.0, d.color.add())
     }
 }
@@ -24,7 +24,7 @@ impl<F: Real> ImageTerm<F> for DepthSmoothness {
         Needs { depth: true, extra: Vec::new() }
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         depth_smoothness(shown.depth, shown.alpha, view.truth, self.0, d.depth.add(), d.alpha.add())
     }
 }

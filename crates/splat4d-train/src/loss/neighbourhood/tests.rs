@@ -46,7 +46,7 @@ fn all() -> LossSettings {
     }
 }
 
-/// Answers of no model in particular.
+/// Arbitrary results of a model.
 fn answers(probes: &[Probe]) -> Vec<Vec<Table<f64>>> {
     let rng = Rng::new(5, "answers", 0);
     let table = |p: &Probe, t: usize| {
@@ -78,7 +78,7 @@ fn eval(
 }
 
 #[test]
-fn what_has_no_held_part_has_the_gradient_of_its_value() {
+fn inputs_without_held_parts_have_the_gradient_of_their_value() {
     let scene = scene(LifeKind::Infinite);
     for weights in [
         LossSettings { iso: 0.5, ..LossSettings::default() },

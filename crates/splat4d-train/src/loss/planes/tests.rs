@@ -14,7 +14,7 @@ fn planes() -> (Params<f64>, Planes) {
     (p, planes)
 }
 
-/// Sets every plane: f(plane, place along the first axis, along the second, channel).
+/// Sets every plane: f(plane, position along the first axis, along the second, channel).
 fn set(p: &mut Params<f64>, planes: &Planes, f: impl Fn(usize, usize, usize, usize) -> f64) {
     for (level, keys) in planes.keys().iter().enumerate() {
         for (plane, &key) in keys.iter().enumerate() {
@@ -82,7 +82,7 @@ fn gradients_equal_differences_and_locked_levels_rest() {
                         value
                     };
                     let fd = (side(1e-6) - side(-1e-6)) / 2e-6;
-                    // The gradient was asked for three times over.
+                    // The gradient was requested three times over.
                     let got = d.table(key).get(i, 0) / 3.0;
                     assert!((fd - got).abs() < 1e-8 * (1.0 + fd.abs()), "level {level}, {i}: {fd} {got}");
                 }

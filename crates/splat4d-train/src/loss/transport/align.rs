@@ -1,8 +1,9 @@
-//! The alignment of what is seen with what is made of it: D(o, F), o the answer of the model inside of a filter, F the
-//! state that the filter makes of it and of its prediction. A model that moves steadily costs nothing.
+//! The alignment of observation and filter state: D(o, F), o the result of the model inside a filter, F the state that
+//! the filter makes of it and of its prediction. A model that moves steadily costs nothing.
 //!
-//! The gradient goes through both: to o itself, and through the fusion (and, with `filter.stop_gradient=false`, through the
-//! prediction) to everything that F is made of, the gains among it. Without a filter there is no state, and no loss.
+//! The gradient is propagated through both: to o itself, and through the fusion (and, with
+//! `filter.stop_gradient=false`, through the prediction) to everything that F is made of, the gains among it. Without a
+//! filter there is no state, and no loss.
 
 use super::TransportConfig;
 use crate::loss::terms::{ParamLoss, StepInfo};
@@ -76,7 +77,7 @@ impl<F: Real> ParamLoss<F> for Align {
     }
 }
 
-/// A model and its answer to one question.
+/// A model and its result to one query.
 struct Side<'a, F: Real> {
     model: &'a dyn Motion<F>,
     cache: Cache,

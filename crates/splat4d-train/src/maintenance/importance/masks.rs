@@ -1,5 +1,5 @@
-//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2),
-//! united with the lives that no key time meets.
+//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2), united
+//! with the lifespans that no key time meets.
 
 use super::temporal::Spatial;
 use super::weighing::Weighing;
@@ -27,7 +27,7 @@ impl Default for MaskConfig {
     }
 }
 
-/// Key times so many frames apart, for training frames at `times` (rising) of a clip of `fps` frames a second: always
+/// Key times this many frames apart, for training frames at `times` (rising) of a clip of `fps` frames a second: always
 /// times of training frames, the first and the last among them.
 pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
     let [Some(&first), Some(&last)] = [times.first(), times.last()] else { return Vec::new() };
@@ -47,9 +47,9 @@ pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
 }
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
-/// above 0, behind what hides them). One whose life is between two key times and meets none is admitted at both; one
-/// that lives wholly before or after all training frames at none. Masks that the layers have count for nothing.
-/// `progress` hears of views done and in all.
+/// above 0, behind what hides them). One whose lifespan is between two key times and meets none is admitted at both;
+/// one that is alive only before or after all training frames at none. Existing masks of the layers are ignored.
+/// `progress` is called with the finished and the total number of views.
 ///
 /// Errors: there is no frame.
 pub(crate) fn key_masks(
@@ -86,7 +86,7 @@ pub(crate) fn key_masks(
     }
     for (layer, mut masks) in scene.layers.iter_mut().zip(masks) {
         for (row, [from, to]) in layer.spans().into_iter().enumerate().filter(|(_, [from, to])| from <= to) {
-            // The keys around its first moment; it meets none if it is over before the later one.
+            // The keys around its first time; it meets none if it is over before the later one.
             let [l, r] = masks.keys_at(from);
             if l != r && to < keys[r] {
                 masks.set(l, row);

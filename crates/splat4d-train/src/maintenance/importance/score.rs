@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training images each is, at times that its life serves well.
+//! Importance scores of Gaussians: how much of the training images each is, at times that its lifespan serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -29,18 +29,18 @@ pub(crate) const UNIT_FRAMES: f64 = 30.0;
 pub(crate) struct ScoreConfig {
     /// The quantity of a view that counts.
     pub spatial: Spatial,
-    /// The temporal score of the life.
+    /// The temporal score of the lifespan.
     pub temporal: Temporal,
     /// How it meets the spatial score.
     pub combine: Combine,
     /// Whether the temporal score is multiplied with a power of the volume in space and time.
     pub volume: bool,
-    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend as
-    /// much a pixel as what is solid does, and gives less (our own addition; 0: as published).
+    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze is pruned first: it costs as
+    /// much blending per pixel as solid Gaussians, and contributes less (our own addition; 0: as published).
     pub cost: f64,
-    /// Frames of a unit of time, in which derivatives of the life are measured (`UNIT_FRAMES`).
+    /// Frames of a unit of time, in which derivatives of the lifespan are measured (`UNIT_FRAMES`).
     pub unit: f64,
-    /// Every so many of the views at a time are examined, another choice at each time, and at least one.
+    /// Every n of the views at a time are examined, another choice at each time, and at least one.
     pub every: usize,
     /// As the scene was trained.
     pub antialias: Antialias,
@@ -73,8 +73,8 @@ pub struct Scores {
     pub views: usize,
 }
 
-/// Scores all Gaussians of `scene` by the views of `frames`; no image is loaded. `progress` hears of views done and
-/// in all. The same bits for any number of threads.
+/// Scores all Gaussians of `scene` by the views of `frames`; no image is loaded. `progress` is called with the number
+/// of views done and in all. The same bits for any number of threads.
 ///
 /// Errors: there is no frame.
 pub(crate) fn score(
@@ -172,12 +172,12 @@ pub(crate) fn score(
             }
         }
     }
-    // A Gaussian that is not finite is not drawn; its life may be anything.
+    // A Gaussian that is not finite is not rendered; its lifespan may be anything.
     layers.iter_mut().flatten().filter(|s| s.is_nan()).for_each(|s| *s = 0.0);
     Ok(Scores { layers, spatial, views: total })
 }
 
-/// Every so many of the views at the k-th time, beginning elsewhere at each; at least one.
+/// Every n of the views at the k-th time, beginning elsewhere at each; at least one.
 fn views_at(group: &[u32], k: usize, every: usize) -> Vec<usize> {
     let some: Vec<usize> =
         group.iter().enumerate().filter(|(i, _)| (i + k).is_multiple_of(every)).map(|(_, &f)| f as usize).collect();

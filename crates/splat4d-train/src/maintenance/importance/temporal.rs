@@ -1,11 +1,11 @@
-//! How much of the clip a Gaussian's life serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025, §4.1),
-//! and its variants.
+//! How much of the clip a Gaussian's lifespan serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025,
+//! §4.1), and its variants.
 //!
-//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than
-//! its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
-//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text states takes
-//! the product with the spatial score time by time: absent times vanish, and each present one weighs 1
-//! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
+//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the lifespan, summed over the whole clip, ranks in the opposite
+//! order than its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short lifespan, and a
+//! time at which the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the
+//! text states takes the product with the spatial score time by time: absent times vanish, and each present one weighs
+//! 1 (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
 use crate::settings::nearest;
 use crate::{Error, Result};
@@ -17,7 +17,7 @@ use std::str::FromStr;
 /// |p''| of the literal score is cut here: tanh is 1 to 7 digits, and Σ stays finite.
 const LITERAL_LIMIT: f64 = 8.0;
 
-/// How a life becomes a temporal score.
+/// How a lifespan becomes a temporal score.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Temporal {
@@ -28,7 +28,7 @@ pub enum Temporal {
     LiteralSignedClamped,
     /// 1/(½ tanh|p'(t)| + ½) at every time.
     FirstDerivative,
-    /// The variance of the life, the clip's length squared at most.
+    /// The variance of the lifespan, the clip's length squared at most.
     Width,
     /// The mean of p over all times of the clip.
     ActiveFraction,
@@ -44,17 +44,18 @@ pub enum Spatial {
     #[default]
     Share,
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
-    /// stand in for each other, and may all go.
+    /// replace each other, and may all go.
     Change,
-    /// The geometric mean of both in each view: neither what covers nor what differs from what is behind goes first.
+    /// The geometric mean of both in each view: neither covering Gaussians nor those that differ from the background
+    /// are pruned first.
     Both,
     /// Opacity at every time at which a view shows it (3DGS).
     Opacity,
     /// The share, times min(V/V₉₀, 1)^0.1 of the volume: the global significance of LightGaussian (Fan et al. 2024).
     LightGaussian,
     /// The sixth root of the determinant of the 6x6 Fisher block of mean and scale over all views: the rank of its
-    /// logarithm, by which PUP 3D-GS (Hanson et al. 2025) prunes in rounds. What one view alone shows has no full block and
-    /// goes first.
+    /// logarithm, by which PUP 3D-GS (Hanson et al. 2025) prunes in rounds. Gaussians in a single view have no full
+    /// block and are pruned first.
     Pup,
     /// Σ over pixels and channels of the squared gradient to the bare bell (Speedy-Splat, Hanson et al. 2025).
     Speedy,
@@ -132,7 +133,7 @@ names!(
 );
 names!(Combine, "way to combine scores", Product "product", Sum "sum", TemporalAlone "temporal-alone");
 
-/// The lives of a layer's Gaussians on a clock of its own unit.
+/// The lifespans of a layer's Gaussians on a clock of its own unit.
 pub(super) struct Lives {
     kind: LifeKind,
     rows: Vec<[f64; 3]>,
@@ -150,7 +151,7 @@ impl Lives {
         Self { kind, rows, span: layer.span, clip, unit }
     }
 
-    /// The score of a time at which the Gaussian is seen; 1 where the score is one of the whole life.
+    /// The score of a time at which the Gaussian is seen; 1 where the score is one of the whole lifespan.
     pub(super) fn instant(&self, temporal: Temporal, row: usize, t: Time) -> f64 {
         let row = self.rows[row];
         let steepness = match temporal {
@@ -161,7 +162,7 @@ impl Lives {
         1.0 / (0.5 * steepness.abs().tanh() + 0.5)
     }
 
-    /// The score of the whole life, of which `times` are the times; 1 where the score is one of times.
+    /// The score of the whole lifespan, of which `times` are the times; 1 where the score is one of times.
     pub(super) fn whole(&self, temporal: Temporal, row: usize, times: &[Time]) -> f64 {
         let row = self.rows[row];
         let seen = || times.iter().filter(|t| self.span[0] <= t.0 && t.0 < self.span[1]);
@@ -183,8 +184,8 @@ impl Lives {
         }
     }
 
-    /// The life's scale in time, units, at most the clip: a Gaussian's standard deviation; of an interval its half plus
-    /// its softness.
+    /// The lifespan's scale in time, units, at most the clip: a Gaussian's standard deviation; of an interval its half
+    /// plus its softness.
     pub(super) fn scale(&self, row: usize) -> f64 {
         self.deviation(self.rows[row])
     }
@@ -215,7 +216,7 @@ mod tests {
 
     const LIVES: [f64; 7] = [1.0, 3.0, 7.0, 15.0, 30.0, 67.0, 212.0];
 
-    /// The default score of lives whose spatial score at a time is p.
+    /// The default score of lifespans whose spatial score at a time is p.
     #[test]
     fn the_default_score_grows_with_lifespan() {
         let score = |frames: f64| {
@@ -225,7 +226,7 @@ mod tests {
         };
         let scores = LIVES.map(score);
         assert!(scores.windows(2).all(|w| w[0] < w[1]), "{scores:?}");
-        // Computed apart from this code, from the formula; where a short life is between frames matters by 3 %.
+        // Computed apart from this code, from the formula; where a short lifespan is between frames matters by 3 %.
         for (s, expected) in scores.iter().zip([2.5, 7.5, 18.2, 41.8, 106.0, 296.0, 545.0]) {
             assert!((s / expected - 1.0).abs() < 0.04, "{scores:?}");
         }
@@ -272,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn names_come_back_and_wrong_ones_get_a_suggestion() {
+    fn names_round_trip_and_wrong_ones_get_a_suggestion() {
         for t in Temporal::ALL {
             assert_eq!(t.name().parse::<Temporal>().unwrap(), *t);
         }

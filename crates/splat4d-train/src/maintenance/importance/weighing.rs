@@ -86,7 +86,7 @@ impl Weighing {
                 self.shares[first..first + count].iter().zip(projected).enumerate().filter(|(_, (s, _))| **s > 0.0);
             for (j, (&share, projected)) in seen {
                 match self.spatial {
-                    // How opaque it is does not depend on how many look.
+                    // How opaque it is does not depend on the number of views.
                     Spatial::Opacity => sums[rows.id(j)] = f64::from(tape.out().get(j, SPLAT_OPACITY)),
                     _ => sums[rows.id(j)] += f64::from(share),
                 }
@@ -100,7 +100,7 @@ impl Weighing {
         }
     }
 
-    /// Where the score is one of all views together: the importance of every row of a layer.
+    /// If the score is one of all views together: the importance of every row of a layer.
     pub(super) fn whole(&self, layer: usize) -> Option<Vec<f64>> {
         Some(self.blocks.get(layer)?.iter().map(root_of_determinant).collect())
     }
@@ -130,7 +130,7 @@ pub(super) fn root_of_determinant(upper: &[f64; 21]) -> f64 {
     if !diagonal.iter().all(|d| *d > 0.0 && d.is_finite()) {
         return 0.0;
     }
-    // Over its own diagonal the block knows no unit, and its pivots are between 0 and 1.
+    // Divided by its own diagonal the block is unitless, and its pivots are between 0 and 1.
     for (i, row) in m.iter_mut().enumerate() {
         for (j, x) in row.iter_mut().enumerate() {
             *x /= diagonal[i].sqrt() * diagonal[j].sqrt();

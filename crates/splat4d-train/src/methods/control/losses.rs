@@ -15,17 +15,17 @@ const ARAP_NEIGHBOURS: usize = 10;
 const ELASTIC_NEIGHBOURS: usize = 2;
 /// Times that elastic distances are compared at (SC-GS).
 const ELASTIC_TIMES: usize = 8;
-/// Width of the window of times that ARAP and elastic distances look at, of the clip (SC-GS).
+/// Width of the window of times of ARAP and elastic distances, of the clip (SC-GS).
 const WINDOW: f64 = 0.05;
-/// Acceleration is taken over so many frames to both sides (SC-GS).
+/// Acceleration is taken over this many frames to both sides (SC-GS).
 const ACCELERATION_FRAMES: f64 = 3.0;
 
-/// Positions of all rows of an answer.
+/// Positions of all rows of a result.
 fn positions<F: Real>(seen: &Table<F>) -> Vec<[F; 3]> {
     (0..seen.rows()).map(|r| seen.read::<3>(r, 0)).collect()
 }
 
-/// Adds gradients of positions to an answer's gradient.
+/// Adds gradients of positions to a result's gradient.
 fn give<F: Real>(to: &mut Table<F>, d: &[[F; 3]]) {
     d.iter().enumerate().for_each(|(r, d)| to.add(r, 0, *d));
 }
@@ -36,7 +36,7 @@ fn nodes_at<F: Real>(scene: &Scene<F>, times: Vec<Time>) -> Vec<Probe> {
     layer.map(|layer| Probe { layer, of: Space::Nodes, rows: None, times }).into_iter().collect()
 }
 
-/// Draws numbers of one step.
+/// Draws the random numbers of one step.
 fn draw(info: &StepInfo, purpose: &str) -> Rng {
     Rng::new(info.seed, purpose, info.iteration as u64)
 }
@@ -77,7 +77,7 @@ impl<F: Real> ProbeLoss<F> for NodeArap {
     }
 }
 
-/// Distances between neighbouring nodes stay as they are through a small window of time.
+/// Distances between neighbouring nodes are constant over a small window of time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct NodeElastic {
     /// Weight; the loss has no unit.

@@ -1,4 +1,4 @@
-//! Gradients through the whole chain of what is drawn next to colours: depth, normals, flow and a column's sigmoid.
+//! Gradients through the whole chain of the channels next to colours: depth, normals, flow and a column's sigmoid.
 
 use super::*;
 use crate::capture::frames::FlowTruth;
@@ -12,7 +12,7 @@ impl ImageTerm<f64> for Weighted {
         self.0.clone()
     }
 
-    fn eval(&mut self, _: &StepInfo, _: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut LossGrads<f64>) -> f64 {
         let mut sum = 0.0;
         let mut weigh = |name: &str, d: &mut Planes<f64>, image: &Planes<f64>| {
             let rng = Rng::new(1, name, 0);
@@ -74,7 +74,7 @@ fn depth_normals_and_flow_have_the_gradient_of_their_values() {
     for life in [LifeKind::Infinite, LifeKind::GaussHalf] {
         let scene = moving(life);
         let velocities = scene.layers[0].params.find("velocities").unwrap();
-        // Opacity logits stand for a learnt column: it is the sigmoid of any.
+        // Opacity logits represent a learnt column: it is the sigmoid of any.
         let sigmoid = Channel::Sigmoid("opacity_logits".to_owned());
         for needs in [
             Needs { depth: true, extra: vec![Channel::Normals, Channel::Flow, Channel::Tracks, sigmoid] },

@@ -121,7 +121,7 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
     let (p, moments) = (&train_state.scene().layers[0].params, train_state.moments());
     assert!(skin.count(p) > 19 && skin.count(p) <= 21, "{} nodes", skin.count(p));
     assert!((0..skin.count(p)).all(|k| p[skin.nodes].get(k, 0) < 49.0), "a node without Gaussians stays");
-    // The strongest strain comes first: the node that was born for it stands among its Gaussians.
+    // The strongest strain comes first: the node that was born for it is among its Gaussians.
     let born = p[skin.nodes].read::<3>(19, 0);
     let off: f32 = (0..3).map(|k| (born[k] - home[k]).powi(2)).sum::<f32>().sqrt();
     assert!(off < 0.2, "the new node is {off} away from what strains");
@@ -161,7 +161,7 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
     }
 }
 
-/// Shaken nodes come to rest in training, whatever the images say.
+/// Shaken nodes settle in training, independent of the images.
 #[test]
 fn losses_on_nodes_reduce_jitter() {
     let clip = [0.0, 0.2];

@@ -1,5 +1,5 @@
-//! One row edit moves Gaussians, a model's per-Gaussian parameters, pages, moments and statistics alike: random edits on
-//! tables in which every number states from which row and column it came.
+//! One row edit moves Gaussians, a model's per-Gaussian parameters, pages, moments and statistics alike: random edits
+//! on tables in which every number encodes its row and column.
 
 use super::*;
 use crate::optim::Moments;

@@ -38,7 +38,7 @@ fn every_gradient_of_features_and_head_equals_finite_differences() {
     }
 }
 
-/// With `detach` Δ is a constant to features too: the life's centre learns from opacity alone.
+/// With `detach` Δ is a constant to features too: the lifespan's centre learns from opacity alone.
 #[test]
 fn detached_features_give_lifespans_no_gradient() {
     let gradient = |detach: bool| {
@@ -61,7 +61,7 @@ fn detached_features_give_lifespans_no_gradient() {
     assert!(gradient(false) > 0.1);
 }
 
-/// The synthetic capture, whose ball changes its colour with time and with the place it is seen from.
+/// The synthetic capture, whose ball changes its colour with time and with the position it is seen from.
 struct Changing(Made);
 
 impl Frames for Changing {
@@ -136,7 +136,7 @@ fn colours_that_change_with_time_and_view_are_learnt_better_with_a_head() {
 }
 
 #[test]
-fn rows_come_and_go_with_their_features() {
+fn row_edits_carry_features_along() {
     let mut scene = featured::<f32>(LifeKind::GaussHalf, false, false);
     let key = scene.layers[0].params.find("features").unwrap();
     let (first, head) = (scene.layers[0].params[key].read::<6>(7, 0), HeadKeys::of(&scene.layers[0].params).unwrap());

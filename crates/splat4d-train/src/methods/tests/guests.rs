@@ -1,5 +1,5 @@
-//! Birth and death under deformation models: an object that appears, one that leaves, one that stays. With a life envelope
-//! none of them leaves a ghost; without it the deformation alone has to hide them.
+//! Birth and death under deformation models: an object that appears, one that leaves, one that stays. With a lifespan
+//! envelope none of them leaves a ghost; without it the deformation alone has to hide them.
 
 use super::*;
 use crate::init::Source;

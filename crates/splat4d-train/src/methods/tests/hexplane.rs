@@ -83,7 +83,7 @@ fn each_stage_learns_its_part_and_together_they_follow_the_ball() {
 }
 
 #[test]
-fn rates_and_densification_go_on_over_the_stages() {
+fn rates_and_densification_continue_over_the_stages() {
     let (mut program, mut plan) = plan();
     plan.common.densify.strategy = Strategy::Adc;
     (plan.common.densify.from, plan.common.densify.until) = (20, 100);

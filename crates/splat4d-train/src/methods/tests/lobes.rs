@@ -156,7 +156,7 @@ fn a_split_keeps_mean_and_covariance_of_the_pair() {
 }
 
 #[test]
-fn relocation_resizes_what_the_model_is_made_of() {
+fn relocation_resizes_the_tables_of_the_model() {
     let (mut scene, _) = lobes_scene::<f64>(3);
     let before = shapes(&scene)[1];
     scene.layers[0].resize(1, 0.5);

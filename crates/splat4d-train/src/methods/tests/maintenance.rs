@@ -1,5 +1,5 @@
-//! Edits of rows in the middle of a stage: every loss hears of them, and guided sampling finds what no Gaussian stands
-//! for.
+//! Edits of rows in the middle of a stage: every loss is notified of them, and guided sampling finds what no Gaussian
+//! represents.
 
 use super::*;
 use crate::maintenance::importance::Spatial;
@@ -12,7 +12,7 @@ use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Counts what it hears.
+/// Counts its notifications.
 #[derive(Clone, Default)]
 struct Ear {
     heard: Arc<AtomicUsize>,
@@ -125,7 +125,7 @@ fn sized(scene: Scene<f32>, stages: Vec<Stage>, size: usize) -> Trainer<'static>
 }
 
 #[test]
-fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
+fn guided_sampling_finds_a_sky_without_gaussians() {
     let run = |guided: Option<GuidedSettings>| {
         // All at the ball: the sky of the capture is not the background.
         let mut p = cloud::<f32>(60, LifeKind::GaussHalf, 3);

@@ -21,7 +21,7 @@ mod wrapper;
 
 use super::*;
 use crate::capture::frames::{Frames, Picture};
-use crate::loss::image::{ImageTerm, PictureGrads, Shown};
+use crate::loss::image::{ImageTerm, LossGrads, Shown};
 use crate::maintenance::Limits;
 use crate::recipe::Recipe;
 use crate::recipe::parts::PROGRAMS;
@@ -34,7 +34,7 @@ use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::{MODELS, Motion, SpacetimeSpec, build_as};
 use splat4d::render::{
-    self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
+    self, Abilities, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, oracle,
 };
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LIFE, Params, Planes, SH, Space, Table, Time};
@@ -93,11 +93,11 @@ fn smooth() -> RenderConfig {
     RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..RenderConfig::default() }
 }
 
-/// The oracle as a drawing device: a forward without gradients.
+/// The oracle as a rendering device: a forward without gradients.
 struct Oracle(RenderConfig);
 
 impl Backend<f64> for Oracle {
-    fn can(&self, _: &Wanted) -> Result<()> {
+    fn can(&self, _: &Abilities) -> Result<()> {
         Ok(())
     }
 
@@ -137,7 +137,7 @@ impl Backend<f64> for Oracle {
 struct Squared;
 
 impl ImageTerm<f64> for Squared {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut LossGrads<f64>) -> f64 {
         let n = shown.color.data.len() as f64;
         let d_color = d.color.overwrite().expect("there is one term");
         d_color.clone_from(shown.color);
@@ -173,7 +173,7 @@ fn shots(list: &[(usize, f64)]) -> Vec<Shot> {
 /// The losses of a check next to the images.
 type Probes = Vec<Box<dyn ProbeLoss<f64>>>;
 
-/// One step of the chain with any drawing device.
+/// One step of the chain with any rendering device.
 fn step(
     scene: &Scene<f64>,
     shots: &[Shot],
@@ -214,8 +214,9 @@ fn assert_close(got: f64, fd: f64, what: &str) {
     assert!((got - fd).abs() <= floor + relative * fd.abs(), "{what}: chain {got:e}, differences {fd:e}");
 }
 
-/// Every column of a few rows of every trainable table, and dL/dt and dL/d pose of every view, against central differences. Returns
-/// the largest gradient of every table of every layer, so that a test can say which parameters must be reached.
+/// Every column of a few rows of every trainable table, and dL/dt and dL/d pose of every view, against central
+/// differences. Returns the largest gradient of every table of every layer, so that a test can say which parameters
+/// must be reached.
 fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<Vec<(String, f64)>> {
     let (report, d, _) = step(scene, shots, probes, &mut Renderer::new(smooth()));
     assert_close(report.loss, value(scene, shots, probes), "the loss");

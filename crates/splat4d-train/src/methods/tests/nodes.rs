@@ -12,7 +12,7 @@ use splat4d::scene::{RowEdit, SplatGrads};
 const PULLS: usize = 2;
 /// Seconds between two pages.
 const PAGE_SECONDS: f64 = 0.1;
-/// Opacity with which nodes answer as splats.
+/// Opacity with which nodes are rendered as splats.
 const NODE_OPACITY: f64 = 0.5;
 
 /// μ = Σ w_b (c_b + A_b (μ₀ − c_b) + τ_b), Σ = A Σ₀ Aᵀ, A = Σ w_b (I + [ω_b]×): a linear blend, not a rotation. Poses
@@ -108,7 +108,7 @@ fn full<F: Real>(c: [F; 6]) -> Matrix<F> {
     [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]]
 }
 
-/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal stands for two places.
+/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal represents two positions.
 fn full_gradient<F: Real>(c: [F; 6]) -> Matrix<F> {
     let h = F::HALF;
     full([c[0], h * c[1], h * c[2], c[3], h * c[4], c[5]])
@@ -203,7 +203,7 @@ impl<F: Real> Motion<F> for Skinned {
                 d_time += (0..6).map(|k| (d_pose[k] * speed[k]).f64()).sum::<f64>();
                 self.pose_backward(d, q.t, node, d_pose);
             }
-            // Off-diagonals stand for both their places again.
+            // Off-diagonals represent both their places again.
             let m = d_rest;
             let d_row = [
                 d_mean0[0],
@@ -270,7 +270,7 @@ fn linear<F: Real>(pose: &[F; 6]) -> Matrix<F> {
     [[F::ONE, -z, y], [z, F::ONE, -x], [-y, x, F::ONE]]
 }
 
-/// Pulls nodes towards where the object is known to be: a loss on nodes, who answer as splats.
+/// Pulls nodes towards where the object is known to be: a loss on nodes, which are evaluated as splats.
 struct Anchors {
     at: Vec<([f64; 3], Time)>,
 }

@@ -1,4 +1,5 @@
-//! Pruning and masks take part in any model's training: a deformation model, whose Gaussians nodes carry, with a life.
+//! Pruning and masks take part in any model's training: a deformation model, whose Gaussians nodes carry, with a
+//! lifespan.
 
 use super::nodes::Skinned;
 use super::*;
@@ -6,7 +7,7 @@ use crate::maintenance::importance::{MaskConfig, ScoreConfig, Spatial, key_masks
 use crate::maintenance::{Prune, PruneSettings};
 use crate::train_state::TrainState;
 
-/// A deformation model whose nodes move between its two pages, and whose first ten Gaussians live for a moment.
+/// A deformation model whose nodes move between its two pages, and whose first ten Gaussians are short-lived.
 fn deformed(rows: usize) -> Scene<f32> {
     let mut params = cloud::<f32>(rows, LifeKind::GaussHalf, 3);
     let centers = [[0.3, 0.0, 0.0], [-0.3, 0.1, 0.0], [0.0, -0.3, 0.2]];

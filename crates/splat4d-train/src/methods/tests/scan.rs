@@ -1,5 +1,5 @@
-//! A sequential model: the state at t comes from a scan over all times, so that its parameters are reached only through
-//! `prepare` and `finish`.
+//! A sequential model: the state at t is computed by a scan over all times, so that its parameters are reached only
+//! through `prepare` and `finish`.
 
 use super::*;
 use splat4d::motion::still::{activate, activate_backward};

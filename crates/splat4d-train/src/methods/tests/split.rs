@@ -1,4 +1,4 @@
-//! The split into still and moving is asked for by a recipe, in the last stage of any program.
+//! The split into still and moving is requested by a recipe, in the last stage of any program.
 
 use super::*;
 use crate::maintenance::At;

@@ -1,4 +1,4 @@
-//! A loss over triples of times, merged with the step's views: one question a distinct (layer, time).
+//! A loss over triples of times, merged with the step's views: one query a distinct (layer, time).
 
 use super::*;
 use crate::step::chain::Probe;
@@ -45,7 +45,7 @@ const TIMES: [f64; 3] = [0.0, 0.1, 0.2];
 
 fn two_layers() -> Scene<f64> {
     let mut p = cloud::<f64>(8, LifeKind::GaussHalf, 21);
-    // Rows that no view at 0.1 sees: the probe asks for them all the same.
+    // Rows that no view at 0.1 sees: the probe requests them all the same.
     p[LIFE].write(2, 0, [5.0, -2.0]);
     p[LIFE].write(6, 0, [5.0, -2.0]);
     let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, ..SpacetimeSpec::default() });
@@ -83,7 +83,7 @@ fn probes_and_views_share_their_queries() {
     }
 }
 
-/// The loss from plain questions to the layer.
+/// The loss from plain queries to the layer.
 fn direct(scene: &Scene<f64>, rows: Option<&[u32]>) -> f64 {
     let seen = TIMES.map(|t| {
         let mut tape = LayerTape::default();

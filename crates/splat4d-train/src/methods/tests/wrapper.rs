@@ -74,7 +74,7 @@ impl<F: Real> Motion<F> for Wrapped<F> {
     }
 }
 
-/// Colours of its own, [N, 3], that depend on time, and a life of its own: what no other synthetic model has.
+/// Colours of its own, [N, 3], that depend on time, and a lifespan of its own: what no other synthetic model has.
 #[derive(Clone, Copy)]
 struct Glow {
     color: Key,

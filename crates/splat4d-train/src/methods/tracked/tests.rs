@@ -20,7 +20,7 @@ const FPS: f64 = 10.0;
 /// Radius of the ball.
 const RADIUS: f64 = 0.6;
 
-/// Images of a scene, drawn beforehand, camera by camera at every time.
+/// Images of a scene, rendered beforehand, camera by camera at every time.
 struct Drawn {
     cameras: Vec<Camera>,
     pictures: Vec<Picture>,
@@ -58,7 +58,7 @@ fn cameras(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// A random pattern of splats on a ball, and as many that stand around it.
+/// A random pattern of splats on a ball, and as many that are around it.
 fn ball(rows: usize, standing: usize) -> Params<f32> {
     let mut p = Params::new(rows + standing, 1, &[]);
     let rng = Rng::new(8, "ball", 0);
@@ -111,7 +111,7 @@ fn truth(params: &Params<f32>, turning: usize, frames: usize, angle: f64) -> Sce
     s
 }
 
-/// Draws a scene from all cameras; masks are where the first `masks` rows are what is seen.
+/// Renders a scene from all cameras; masks are where the first `masks` rows are what is seen.
 fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize>) -> Drawn {
     let mut renderer = Renderer::new(RenderConfig::default());
     let (mut image, mut instant) = (Image::default(), Evaluation::default());

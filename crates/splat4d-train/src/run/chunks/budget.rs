@@ -1,4 +1,4 @@
-//! What a take in chunks costs before it is begun, and the plan that stays within a memory limit and a time: shorter chunks of
+//! Estimated cost of a take in chunks, and the plan that stays within a memory limit and a time: shorter chunks of
 //! fewer Gaussians, and the steps of a chunk. [`Pacing`] keeps the parts to that time while they are trained.
 
 use super::shared::STEPS;
@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 /// Share of the time that timing steps may take (as for captures that are learnt at once).
 const PROBES: f64 = 0.06;
-/// Seconds that timing steps takes where only the length is asked for.
+/// Seconds that timing steps takes where only the length is requested.
 const PREDICTION: f64 = 6.0;
 /// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be recognised in the images.
 const FEWEST: usize = 1000;
@@ -67,12 +67,12 @@ impl Pacing {
 }
 
 impl ChunkEstimate {
-    /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is listed.
-    /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. What the caller
-    /// does after training takes as long as `finish` steps at its end. `timed`: steps are timed even without `minutes`.
-    /// `None`: the capture is learnt at once.
+    /// Examines a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is
+    /// listed. Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit.
+    /// The caller's work after training takes as long as the last `finish` steps. `timed`: steps are timed even without
+    /// `minutes`. `None`: the capture is learnt at once.
     ///
-    /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; images that cannot be
+    /// Errors: what the recipe requests cannot be had in chunks, or not within these limits; images that cannot be
     /// read.
     pub fn new(
         capture: &Arc<Capture>,

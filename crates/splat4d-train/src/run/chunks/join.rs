@@ -23,7 +23,7 @@ use std::sync::Arc;
 
 /// Cuts at which it is measured how well chunks meet, at most.
 const MEASURED: usize = 16;
-/// Cameras that look at each.
+/// Cameras per cut.
 const CAMERAS: usize = 2;
 /// 8-bit steps in [0, 1]: the unit of flicker.
 const LEVELS: f64 = 255.0;
@@ -43,17 +43,17 @@ pub struct Joined {
     pub peak_memory: u64,
 }
 
-/// Flicker (mean over neighbouring frames of |(R' − R) − (G' − G)|·255) where chunks meet, and for as many frames in their
-/// midst.
+/// Flicker (mean over neighbouring frames of |(R' − R) − (G' − G)|·255) where chunks meet, and for as many frames in
+/// their midst.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Seams {
-    /// Where they overlap.
+    /// Their overlap.
     pub across: f64,
     /// In the middle of chunks.
     pub inside: f64,
     /// Cuts that were examined.
     pub cuts: usize,
-    /// Whether cameras looked that training never saw.
+    /// Whether held-out cameras were used.
     pub held_out: bool,
 }
 
@@ -120,7 +120,7 @@ impl Chunked {
         Ok([from - 0.5 / capture.fps, to + 0.5 / capture.fps])
     }
 
-    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole capture; what all share is left out.
+    /// A finished chunk as a scene of one layer, visible as in the whole capture; the shared part is left out.
     ///
     /// Errors: files that cannot be read.
     pub fn alone(&self, chunk: usize) -> Result<Scene<f32>> {
@@ -158,7 +158,7 @@ impl Chunked {
         Ok(whole)
     }
 
-    /// What all chunks share; none: nothing is static. Errors: the file cannot be read.
+    /// The shared part of all chunks; none: nothing is static. Errors: the file cannot be read.
     pub fn still(&self) -> Result<Option<Layer<f32>>> {
         Ok(shared::read(&self.folder(Part::Shared))?.still)
     }
@@ -186,10 +186,9 @@ impl Chunked {
         Ok(())
     }
 
-    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there
-    /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks
-    /// or images that
-    /// cannot be read.
+    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there is no
+    /// such camera, or no time. Before each cut `go_on` is called with the number of finished ones. Errors: chunks or
+    /// images that cannot be read.
     pub fn seams(&self, go_on: &mut dyn FnMut(usize) -> bool, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
@@ -237,7 +236,7 @@ impl Chunked {
     }
 }
 
-/// Draws what cameras saw.
+/// Renders what cameras saw.
 struct CameraRenders<'a> {
     store: ImageStore,
     backend: Box<dyn splat4d::render::Backend<f32>>,

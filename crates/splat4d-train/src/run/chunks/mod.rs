@@ -39,21 +39,22 @@ use std::time::Duration;
 
 /// Frames of a chunk where the recipe leaves it open (STG: 50).
 const FRAMES: usize = 60;
-/// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for it.
+/// A capture of this many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for
+/// it.
 const WHOLE: usize = 300;
-/// Seconds between two looks whether other workers are done.
+/// Seconds between two checks whether other workers are done.
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
 /// Folder in it whose lock states who writes the playback file.
 const FILM: &str = "film";
-/// Time between two looks whether it may be written.
+/// Time between two checks whether it may be written.
 const TURNS: Duration = Duration::from_millis(200);
 /// File of the plan in it.
 const PLAN: &str = "plan.json";
 /// File of a finished run.
 const SCENE: &str = "scene.safetensors";
-/// What made runs of chunks.
+/// Version of the code that made runs of chunks.
 pub(super) const MADE_BY: &str = "train --chunk";
 
 /// A part of the work on a capture.
@@ -75,7 +76,7 @@ impl std::fmt::Display for Part {
 }
 
 /// The right to write what workers share; given back when it is dropped.
-pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Owner);
+pub struct Turn(#[expect(dead_code, reason = "it is held, not read")] Owner);
 
 /// A run of a long capture.
 pub struct Chunked {
@@ -83,16 +84,18 @@ pub struct Chunked {
     source: PathBuf,
     recipe: Recipe,
     plan: ChunkPlan,
-    /// What the lenses of the capture recorded, from the part that was opened first: it is the same for all.
+    /// Recorded areas of the capture's lenses, from the part that was opened first: it is the same for all.
     lenses: Lenses,
-    /// Keeps what this worker does to its minutes.
+    /// Limits this worker to its minutes.
     pacing: Option<Pacing>,
 }
 
 impl Chunked {
-    /// Begins the run of a capture in the folder `run`, or finds it begun, by whichever worker. `None`: the capture is learnt at once.
+    /// Begins the run of a capture in the folder `run`, or finds it begun, by whichever worker. `None`: the capture is
+    /// learnt at once.
     ///
-    /// Errors: what the recipe asks for cannot be had in chunks; the folder holds the run of another recipe, capture or version.
+    /// Errors: what the recipe requests cannot be had in chunks; the folder holds the run of another recipe, capture or
+    /// version.
     pub fn begin(
         capture: &Arc<Capture>,
         recipe: &Recipe,
@@ -150,7 +153,7 @@ impl Chunked {
         let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
         let print = identity::recipe_print(&recipe, "");
         if print != plan.recipe {
-            return Err(Error::input("the recipe is another than the one that its chunks were planned for")
+            return Err(Error::input("the recipe differs from the one that its chunks were planned for")
                 .at(file.display())
                 .remedy("Put it back as the run wrote it, or train into another folder"));
         }
@@ -176,8 +179,8 @@ impl Chunked {
         &self.plan
     }
 
-    /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there, so that
-    /// what is finished has few gaps.
+    /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there,
+    /// so that the finished part has few gaps.
     pub fn parts(&self) -> Vec<Part> {
         let count = self.plan.len();
         let chunks = (0..count).map(|k| match k {
@@ -223,7 +226,7 @@ impl Chunked {
         })
     }
 
-    /// Does one part; nothing where it is done. Errors: parts before it are missing, another worker has it, and those of
+    /// Trains one part, unless it is done. Errors: parts before it are missing, another worker has it, and those of
     /// training.
     pub fn work(
         &self,
@@ -266,22 +269,21 @@ impl Chunked {
                     ErrorKind::Interrupted,
                     "stopped while another worker writes the playback file",
                 )
-                .remedy("The same command goes on"));
+                .remedy("Run the same command again to continue"));
             }
             std::thread::sleep(TURNS);
         }
     }
 
-    /// What a finished part is known by: its name and a fingerprint of its file. Errors: the file cannot be read.
+    /// Identity of a finished part: its name and a fingerprint of its file. Errors: the file cannot be read.
     pub fn print(&self, part: Part) -> Result<String> {
         let file = if part == Part::Shared { shared::FILE } else { SCENE };
         let bytes = shared::read_file(&self.folder(part).join(file))?;
         Ok(format!("{part} {}", identity::file_print(&bytes)))
     }
 
-    /// Does whatever there is to do until all is done, next to any number of other workers. `finished` hears of
-    /// every part
-    /// that this worker has finished.
+    /// Works on all parts until they are done, next to any number of other workers. `finished` is called with every
+    /// part that this worker has finished.
     ///
     /// Errors: those of training, and of `finished`.
     pub fn work_all(
@@ -312,7 +314,7 @@ impl Chunked {
             }
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::new(ErrorKind::Interrupted, "stopped while other workers train")
-                    .remedy("The same command goes on"));
+                    .remedy("Run the same command again to continue"));
             }
             if !busy {
                 listen(&Event::Phase { name: "waiting for other workers".into(), done: 0, total: 0 });
@@ -389,7 +391,7 @@ fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
     Capture { train, ..capture.clone() }
 }
 
-/// The frames of a capture to look at first: they show whether it is a long capture.
+/// The frames of a capture to examine first: they show whether it is a long capture.
 pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
     let first = recipe.capture.first_frame;
     let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);
@@ -406,7 +408,7 @@ fn chosen(first: &Arc<Capture>, recipe: Recipe, listen: &mut dyn FnMut(&Event)) 
     opened.counted(recipe, &mut listen)
 }
 
-/// Errors: what a recipe asks for that chunks cannot have together.
+/// Errors: what a recipe requests that chunks cannot have together.
 fn check(recipe: &Recipe) -> Result<()> {
     let learnt = learnable(recipe);
     let (what, remedy) = if recipe.spacetime.has_features() {
@@ -414,7 +416,7 @@ fn check(recipe: &Recipe) -> Result<()> {
     } else if learnt.poses || learnt.focal || learnt.times {
         ("cameras that are refined", "Refine them on a part of the capture first (--set max_frames=60)")
     } else if recipe.capture.observe < 1.0 {
-        ("a future that is not looked at (--observe)", "Leave --observe away")
+        ("an unobserved future (--observe)", "Leave --observe away")
     } else {
         return Ok(());
     };

@@ -1,4 +1,4 @@
-//! Where a capture is cut: evenly, moved to where least moves.
+//! Boundaries of chunks: evenly spaced, moved to times of least motion.
 
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
@@ -45,7 +45,7 @@ impl ChunkPlan {
         let end = recipe.capture.first_frame.saturating_add(most).min(capture.take.frames.end);
         let (take, count) = ([first, end], end.saturating_sub(first));
         let fixed = capture.cameras.iter().filter(|c| c.fixed).count() > 1;
-        // `auto` has yet to say.
+        // `auto` has not chosen yet.
         let moves = || recipe.program().map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
         let length = match settings.frames {
             0 if count > WHOLE && fixed && moves() && super::check(recipe).is_ok() => FRAMES,

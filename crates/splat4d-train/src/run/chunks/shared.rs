@@ -1,8 +1,8 @@
-//! What chunks share: the layer of the static background all the time, and the cameras' exposures.
+//! Shared parts of chunks: the layer of the static background and the cameras' exposures.
 //!
-//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene is trained
-//! as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever changes: what is left out
-//! is learnt by the chunks, what would be wrong in there they could not mend.
+//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene
+//! is trained as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever
+//! changes: chunks learn what it omits, but cannot correct errors in it.
 
 use super::Chunked;
 use crate::Result;
@@ -40,28 +40,29 @@ const CAPTURE: &str = "capture";
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
-/// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of ordinary
-/// cameras.
+/// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of
+/// ordinary cameras.
 const CHANGED: f32 = 0.06;
 /// A pixel is calm where at most this share of the frames that are examined has changed.
 const CALM: f64 = 0.1;
-/// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has the figures).
+/// Steps of the layer, in those of a chunk: every chunk shows it and none can correct it (docs/scale.md has the
+/// figures).
 pub(super) const STEPS: usize = 4;
-/// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
+/// A Gaussian stays where it is static in at least this share of the cameras that see it.
 const AGREED: f64 = 0.5;
 
-/// What a finished part states.
+/// Record of a finished part.
 pub(super) struct Shared {
     /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
-    /// What shows where no Gaussian is.
+    /// The background.
     pub background: [f32; 3],
     exposures: Vec<(String, [f32; 12])>,
     /// Fingerprint of it all.
     pub print: String,
 }
 
-/// Trains the part, or goes on with it. `None`: there is nothing that chunks could share.
+/// Trains the part, or continues with it. `None`: there is nothing that chunks could share.
 pub(super) fn train(
     chunked: &Chunked,
     options: &TrainOptions,
@@ -121,7 +122,7 @@ pub(super) fn read(folder: &Path) -> Result<Shared> {
 }
 
 impl Shared {
-    /// The exposures for a capture's cameras; those that are not known show what is drawn. `None`: none was learnt.
+    /// The exposures for a capture's cameras; those that are not known show what is rendered. `None`: none was learnt.
     pub(super) fn exposure(&self, capture: &Capture) -> Option<Exposure> {
         if self.exposures.is_empty() {
             return None;
@@ -137,7 +138,7 @@ impl Shared {
     }
 }
 
-/// Why medians would say nothing.
+/// Why medians would not be informative.
 fn nothing_still(capture: &Capture) -> Option<&'static str> {
     let mut fixed: Vec<usize> =
         capture.train.iter().map(|&i| capture.frames[i].camera).filter(|&c| capture.cameras[c].fixed).collect();
@@ -191,7 +192,7 @@ fn medians(
     let (mut cameras, mut names) = (Vec::new(), Vec::new());
     for rig in 0..capture.cameras.len() {
         listen(&Event::Phase { name: "static background".into(), done: rig, total: capture.cameras.len() });
-        // Frames of the data set stand in the order of `train`.
+        // Frames of the data set are in the order of `train`.
         let frames: Vec<usize> =
             (0..capture.train.len()).filter(|&i| capture.frames[capture.train[i]].camera == rig).collect();
         if frames.is_empty() {
@@ -270,7 +271,7 @@ fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) 
     write_atomically(path, &out)
 }
 
-/// Leaves of a scene the Gaussians that stand where images are calm.
+/// Keeps the Gaussians of a scene in static image regions.
 fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result<()> {
     let mut views: Vec<(Camera, Vec<u8>)> = Vec::new();
     for (rig, camera) in capture.cameras.iter().enumerate() {
@@ -291,7 +292,7 @@ fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result
     Ok(())
 }
 
-/// Whether most of the cameras that look at a place find it calm.
+/// Whether a position is static in most cameras that see it.
 fn is_calm(mean: [f64; 3], views: &[(Camera, Vec<u8>)]) -> bool {
     let (mut seen, mut calm) = (0, 0);
     for (camera, map) in views {

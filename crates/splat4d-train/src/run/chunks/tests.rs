@@ -1,8 +1,9 @@
-//! A tiny take in three chunks: the same scene in whatever order workers take the parts, and clear words where something is missing.
+//! A tiny take in three chunks: the same scene in whatever order workers take the parts, and clear words where
+//! something is missing.
 
 use super::tie::{Neighbour, Tie};
 use super::*;
-use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::Stopwatch;
 use crate::run::tests::{Place, recipe};
@@ -169,7 +170,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
             rig: 0,
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
-        let mut d = PictureGrads::default();
+        let mut d = LossGrads::default();
         d.begin(&image);
         let value = tie.eval(&info, &view, &Shown::new(&image, &[]), &mut d);
         (value, d.grads().color.data.clone())
@@ -182,7 +183,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
     assert!((0..108).all(|i| (f64::from(d[i]) - 0.5 / 108.0 * off(i).signum()).abs() < 1e-9));
 }
 
-/// A clock on which every reading takes so many seconds: a step that is timed takes one, a step of a run some more.
+/// A clock on which every reading takes this many seconds: a step that is timed takes one, a step of a run some more.
 fn ticking(seconds: f64) -> Stopwatch {
     let ticks = std::sync::atomic::AtomicUsize::new(0);
     Stopwatch::of(move || ticks.fetch_add(1, Ordering::Relaxed) as f64 * seconds)
@@ -205,7 +206,7 @@ fn the_parts_end_on_time_on_a_machine_that_is_slower_than_it_was_timed() {
         let begun = Chunked::begin(&capture, &outlook.recipe, &place.run(name), &mut |_| {}).unwrap().unwrap();
         let run = begun.paced(outlook.pacing.filter(|_| paced));
         let options = TrainOptions { clock: clock.clone(), ..TrainOptions::default() };
-        // Stopped once, after a chunk was planned again: it goes on with the plans that it followed.
+        // Stopped once, after a chunk was planned again: it continues with the plans that it followed.
         let (stop, mut stopped) = (AtomicBool::new(false), false);
         let first = run.folder(Part::Chunk(0));
         let mut hear = |event: &Event| {

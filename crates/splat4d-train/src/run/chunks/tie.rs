@@ -2,7 +2,7 @@
 
 use super::shared::read_file;
 use crate::Result;
-use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::identity::file_print;
 use crate::train_state::Exposure;
@@ -32,7 +32,7 @@ impl Neighbour {
 
 /// λ‖I − I'‖₁, the mean over pixels and channels of the difference to the neighbour's image I', as the camera
 /// exposes both.
-/// Source: render-space consistency of overlapping chunks; no gradient goes to the neighbour.
+/// Source: render-space consistency of overlapping chunks; the neighbour has no gradient.
 pub(super) struct Tie {
     weight: f64,
     neighbours: Arc<Vec<Neighbour>>,
@@ -55,13 +55,13 @@ impl Tie {
 }
 
 impl ImageTerm for Tie {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let within = |n: &&Neighbour| n.window[0] <= view.t.0 && view.t.0 <= n.window[1];
         let Some(Neighbour { scene, .. }) = self.neighbours.iter().find(within) else { return 0.0 };
         scene.at(view.t, &mut self.seen);
         let splats = scene.splats(&self.seen);
         let shot = Shot::new(&splats, view.camera, view.background);
-        self.backend.render(&shot, &mut self.image).expect("the processor draws whatever a scene holds");
+        self.backend.render(&shot, &mut self.image).expect("the CPU renders every scene");
         if let Some(exposure) = &self.exposure {
             exposure.respond(view.rig, &mut self.image.color);
         }
@@ -70,7 +70,7 @@ impl ImageTerm for Tie {
         let mut sum = 0.0;
         let numbers = d.color.add().data.iter_mut().zip(shown.color.data.iter().zip(&self.image.color.data));
         for (i, (d, (own, theirs))) in numbers.enumerate() {
-            // Pixels that the lens never filled say nothing.
+            // Pixels that the lens never filled carry no information.
             let counts = view.weight.map_or(1.0, |w| w.data[i % pixels]);
             let off = (own - theirs) * counts;
             sum += f64::from(off.abs());

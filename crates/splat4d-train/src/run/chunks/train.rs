@@ -26,12 +26,12 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// A point within so many Gaussians' spacings of the shared layer shows what that shows.
+/// A point within this many Gaussians' spacings of the shared layer shows what that shows.
 const COVERED: f64 = 2.0;
-/// Share of the room for Gaussians that those of neighbours may take at the start.
+/// Share of the number of Gaussians that those of neighbours may take at the start.
 const TAKEN_OVER: f64 = 0.5;
 
-/// Trains a chunk, or goes on with it.
+/// Trains a chunk, or continues with it.
 pub(super) fn train(
     chunked: &Chunked,
     chunk: usize,
@@ -57,7 +57,7 @@ pub(super) fn train(
         listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
         first_scene(&opened, &recipe, &plan, &shared, &neighbours)?
     } else {
-        // The checkpoint has it.
+        // It is in the checkpoint.
         opened.scene(&recipe, &plan, program.as_ref(), &Seeds::default(), shared.background)?
     };
     let prints: Vec<&str> =
@@ -106,8 +106,8 @@ fn neighbours(chunked: &Chunked, chunk: usize, capture: &Capture) -> Result<Vec<
     chunked.neighbours(chunk).map(one).collect()
 }
 
-/// The scene that a chunk begins with: its own first Gaussians where the shared layer shows nothing, those of its neighbours in
-/// the middle of what they share, and the shared layer, which does not learn.
+/// The scene that a chunk begins with: its own first Gaussians where the shared layer shows nothing, those of its
+/// neighbours in the middle of what they share, and the shared layer, which does not learn.
 fn first_scene(
     opened: &OpenCapture,
     recipe: &Recipe,
@@ -128,9 +128,10 @@ fn first_scene(
         }
     }
     let room = plan.common.densify.max_cap.saturating_sub(still.map_or(0, |l| l.params.len())).max(1);
-    // A Gaussian that lives all the time starts where it is in the middle of the chunk, of which neighbours know nothing.
+    // A Gaussian with an infinite lifespan starts at its position in the middle of the chunk, of which neighbours know
+    // nothing.
     let mut taken: Vec<Params<f32>> = Vec::new();
-    if !program.one_moment(plan) {
+    if !program.one_time(plan) {
         let share = (TAKEN_OVER * room as f64) as usize / neighbours.len().max(1);
         for n in neighbours {
             taken.push(alive(&n.scene, 0.5 * (n.window[0] + n.window[1]), share, plan.seed));
@@ -169,7 +170,7 @@ fn first_scene(
     Ok(scene)
 }
 
-/// At most so many of the Gaussians of a chunk that are alive at a time, the shared layer apart, as they are then.
+/// At most this many of the Gaussians of a chunk that are alive at a time, without the shared layer, at that time.
 fn alive(scene: &Scene<f32>, time: f64, most: usize, seed: u64) -> Params<f32> {
     let layer = &scene.layers[0];
     let mut rows = Vec::new();

@@ -1,5 +1,5 @@
 //! A scene is pruned, becomes the pages of a file and is tuned: the same bits for any number of threads, after any stop
-//! and after a crash; no stage begins twice.
+//! and after a crash; no stage is repeated.
 
 use super::*;
 use crate::ErrorKind;
@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 const FLOATS: usize = 12;
 const CODED: usize = 18;
 
-/// Something happens before step `at`: `f` hears of the gradients.
+/// A disturbance before step `at`: `f` gets the gradients.
 struct Meddle<F> {
     at: usize,
     f: F,
@@ -255,7 +255,7 @@ fn stages_without_steps_and_codecs_without_tuning() {
     let whole = job.codec.whole(&done.scene);
     assert!(seen.layers.iter().zip(&whole.layers).all(|(a, b)| a.params == b.params));
     assert!(job.codec.pages(&done.scene, Meta::default()).is_ok());
-    // Asked again, nothing begins again.
+    // A second call repeats nothing.
     let mut job = bed.job(no_meddler);
     job.refine.stages.iter_mut().for_each(|s| s.iterations = 0);
     let again = bed.run("none", job.refine, &AtomicBool::new(false), &mut |_| {}).unwrap();

@@ -19,7 +19,7 @@ fn a_run_reports_its_device_and_where_it_resumes() {
     train(place.open(&recipe), recipe.clone(), &run, &options, &stop, &mut listen).unwrap();
     let info = || serde_json::from_str::<Value>(&read_text(&run.join("run.json")).unwrap()).unwrap();
     let device = info()["device"].as_str().unwrap().to_owned();
-    // Where there is no GPU, that is said, and the CPU trains.
+    // Where there is no GPU, that is reported, and the CPU trains.
     let missed = device == "the CPU";
     assert!(told.len() == 1 && told[0].starts_with("training on ") && told[0].contains(&device), "{told:?}");
     assert!(missed == told[0].starts_with("training on the CPU: "), "{told:?}");
@@ -56,7 +56,7 @@ fn a_gpu_that_is_lost_costs_a_run_one_line_and_no_step() {
         };
         let outcome = place.train_with(name, &recipe, draw, &AtomicBool::new(false), &mut listen).unwrap();
         assert!(!outcome.interrupted && outcome.iteration == STEPS);
-        let line = "the GPU that kept the tables failed (the driver is gone): training goes on on the CPU, from its last \
+        let line = "the GPU that kept the tables failed (the driver is gone): training continues on the CPU, from its last \
                     checkpoint, of step 10";
         assert!(warnings == [line] && rolled == 0, "{name}: {warnings:?}");
         let info: Value = serde_json::from_str(&read_text(&place.run(name).join("run.json")).unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! What comes after the observed part reaches no number of a run.
+//! Data after the observed part affects no number of a run.
 
 use super::{MOMENTS, Place, recipe};
 use crate::capture::{Capture, Split};
@@ -9,7 +9,7 @@ const SHARE: f64 = 0.6;
 
 #[test]
 fn other_images_of_the_future_make_the_same_tensors() {
-    // Masks of motion, exposures, clocks, growth and pruning: whatever looks at images is switched on.
+    // Masks of motion, exposures, clocks, growth and pruning: everything that uses images is switched on.
     let settings = [
         "motion=spacetime init=auto densify.interval=5",
         "motion=control control_nodes=12 exposure=true refine.times=true",

@@ -13,7 +13,7 @@ fn long() -> Recipe {
     recipe(&["iterations=320", "densify_until_iter=240", "densification_interval=20", "checkpoint_interval=50"])
 }
 
-/// Trains on a machine whose n-th step takes so many times [`STEP`]; returns the seconds that it took.
+/// Trains on a machine whose n-th step takes this many times [`STEP`]; returns the seconds that it took.
 fn train_slowly(place: &Place, name: &str, slow: fn(usize) -> usize, listen: &mut dyn FnMut(&Event)) -> f64 {
     let ticks = Arc::new(AtomicUsize::new(0));
     let (read, add) = (ticks.clone(), ticks.clone());
@@ -80,7 +80,7 @@ fn a_resumed_run_keeps_its_time_limit_and_history() {
             copy_folder(&place.run("whole"), &place.run("then"));
         }
     });
-    // As it is after a crash: a checkpoint behind the first plan, and later plans.
+    // The state after a crash: a checkpoint behind the first plan, and later plans.
     let crashed = |name: &str| {
         let run = place.run(name);
         copy_folder(&place.run("then"), &run);
@@ -89,7 +89,7 @@ fn a_resumed_run_keeps_its_time_limit_and_history() {
     };
     let whole = saved(&place, "whole").run.replans;
     assert!(whole.rows()[0].at < 100, "{whole:?}");
-    // A clock that is static asks for no plan of its own.
+    // A stopped clock triggers no new plan.
     let run = crashed("crashed");
     let options = TrainOptions { clock: Stopwatch::of(|| 0.0), ..TrainOptions::default() };
     resume_with(&run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();

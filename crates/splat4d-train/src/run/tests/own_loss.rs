@@ -1,7 +1,7 @@
-//! Losses that callers bring along: they count, they may fail within a step, and a run goes on only with them.
+//! Losses that callers bring along: they count, they may fail within a step, and a run continues only with them.
 
 use super::*;
-use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Needs, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::OwnLoss;
 
@@ -19,7 +19,7 @@ impl ImageTerm for Darker {
         Needs::default()
     }
 
-    fn eval(&mut self, info: &StepInfo, _: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, info: &StepInfo, _: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         if let Some(stop) = self.fails.as_ref().filter(|_| info.iteration == FAILS) {
             stop.store(true, Ordering::Relaxed);
             return f64::NAN;

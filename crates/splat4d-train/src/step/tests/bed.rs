@@ -20,8 +20,7 @@ pub(super) struct Bed {
     frames: Arc<Dataset>,
 }
 
-/// What shows where no Gaussian is: on the images' mean colour, the default, little of their error is there to begin
-/// with.
+/// The background: on the images' mean colour, the default, little of their error is there to begin with.
 const BLACK: [f32; 3] = [0.0; 3];
 
 /// The result of a short training.
@@ -87,7 +86,7 @@ impl Bed {
         self.start_on(Device::Cpu, recipe)
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(super) fn start_on(&self, device: Device, recipe: &Recipe) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
@@ -101,7 +100,7 @@ impl Bed {
         self.resumed_on(Device::Cpu, recipe, checkpoint)
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(super) fn resumed_on(&self, device: Device, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);

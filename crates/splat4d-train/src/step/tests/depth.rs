@@ -16,7 +16,7 @@ use std::sync::atomic::AtomicBool;
 /// Codes a scene unit.
 const CODES: f64 = 4096.0;
 
-/// Adds the depth of the ball to the capture on disk, as maps that are `scale` times too large say it.
+/// Adds the depth of the ball to the capture on disk, as maps that are `scale` times too large.
 fn write(place: &Place, made: &Made, scale: f64) {
     let capture = place.open(&recipe(&[]));
     let marker = capture.root.join("capture.json");

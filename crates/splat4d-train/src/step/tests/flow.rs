@@ -11,7 +11,7 @@ use splat4d::math::se3::{dot, normalize, sub};
 use splat4d::render::{RenderConfig, Renderer};
 use splat4d::scene::Camera;
 
-/// Where the pixel of the ball goes in a frame; `None`: it shows the sky.
+/// Displacement of the ball's pixel in a frame; `None`: it shows the sky.
 fn way(made: &Made, camera: &Camera, p: [f64; 2], from: f64, to: f64) -> Option<[f64; 2]> {
     let (eye, center) = (camera.center(), made.object_at(from));
     let ray = normalize(sub(camera.unproject(p, 1.0), eye));

@@ -1,13 +1,13 @@
-//! Training with a GPU that draws, against the CPU alone; on any driver, that of a CPU too. Without one each test prints
-//! "skipped"; with REQUIRE_GPU=1 that is a failure.
+//! Training with a GPU that renders, against the CPU alone; on any driver, that of a CPU too. Without one each test
+//! prints "skipped"; with REQUIRE_GPU=1 that is a failure.
 
 use super::bed::{Bed, bytes, saved, settings};
 use crate::recipe::Recipe;
 use crate::step::trainer::Trainer;
 use splat4d::device::Device;
 
-/// A short recipe of every motion model, and how far its last steps may be off: roundings grow, and where Gaussians are born
-/// and die they decide who.
+/// A short recipe of every motion model, and how far its last steps may be off: roundings grow, and where Gaussians are
+/// born and die they decide who.
 const MODELS: [(&str, f64); 10] = [
     ("motion=still strategy=none sh_degree=2 sh_degree_interval=7", 0.02),
     ("motion=spacetime strategy=none motion_order=2 rotation_rate=true life=interval lambda_velocity=0.1", 0.02),
@@ -20,8 +20,8 @@ const MODELS: [(&str, f64); 10] = [
     ("motion=deform-mlp strategy=none deform_width=16", 0.02),
     ("motion=spacetime strategy=none filter=geodesic", 0.02),
 ];
-/// Steps in which curves are the same but for roundings, and their largest relative difference: Adam's first steps are whole
-/// ones even where a gradient is nothing but roundings.
+/// Steps in which curves are the same but for roundings, and their largest relative difference: Adam's first steps are
+/// whole ones even where a gradient is nothing but roundings.
 const FIRST: (usize, f64) = (5, 2e-3);
 /// Steps at the end whose mean is compared.
 const LAST: usize = 8;
@@ -42,7 +42,7 @@ fn is_of_tables(notice: &str) -> bool {
     notice.contains("the CPU keeps the tables")
 }
 
-/// Mean squared errors of all steps that are left, and what was said.
+/// Mean squared errors of all steps that are left, and what was reported.
 pub(super) fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<String>) {
     let (mut mse, mut notices) = (Vec::new(), Vec::new());
     while !trainer.is_done() {
@@ -53,7 +53,7 @@ pub(super) fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<St
     (mse, notices)
 }
 
-/// Steps until so many are done.
+/// Steps until this many are done.
 pub(super) fn steps_to(trainer: &mut Trainer<'_>, iteration: usize) {
     while trainer.progress.iteration < iteration {
         trainer.step().unwrap().unwrap_or_else(|fault| panic!("step {iteration}: {}", fault.0));
@@ -69,7 +69,7 @@ fn every_model_learns_as_on_the_cpu() {
         let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
         let mut cpu = bed.start(&recipe);
         let ((mse, notices), (expected, _)) = (finish(&mut trainer, line), finish(&mut cpu, line));
-        // These stay on the device whole; of the others neighbours, networks and the filter want something else.
+        // These stay on the device whole; of the others neighbours, networks and the filter need something else.
         let whole = ["motion=still", "motion=native4d", "motion=tracked"];
         let stays = whole.iter().any(|m| line.starts_with(m)) || line.contains("strategy=adc");
         assert!(notices.len() == usize::from(!stays) && notices.iter().all(|n| is_of_tables(n)), "{line}: {notices:?}");
@@ -110,7 +110,7 @@ fn a_run_on_a_gpu_repeats_and_resumes_bit_for_bit() {
         bytes(resumed.scene()) == bytes(trainer.scene()),
         "a resumed run has the bytes of one that was not stopped"
     );
-    // The CPU goes on too, with other last bits.
+    // The CPU continues too, with other last bits.
     let mut elsewhere = bed.resumed(&recipe, first);
     finish(&mut elsewhere, "elsewhere");
     assert!(elsewhere.scene().len().abs_diff(trainer.scene().len()) < 10);

@@ -1,6 +1,5 @@
-//! What a device does with the tables that it keeps in addition to drawing them, against the CPU: ties of tracked
-//! poses, losses on rows and
-//! noise on positions. The camera looks away, so that a step has no other gradient.
+//! What a device does with the tables that it keeps in addition to rendering them, against the CPU: ties of tracked
+//! poses, losses on rows and noise on positions. The camera points away, so that a step has no other gradient.
 
 use crate::loss::graph::Weigh;
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};

@@ -36,12 +36,12 @@ struct Disturbed {
 }
 
 impl Disturbed {
-    /// Clocks that are late by so many frames.
+    /// Clocks that are late by this many frames.
     fn clocks(late: [f64; CAMERAS]) -> Self {
         Self::new(SIZE, 0.0, late, [0.0; CAMERAS])
     }
 
-    /// Poses that are off by about so many radians and radii.
+    /// Poses that are off by about this many radians and radii.
     fn poses(turn: f64) -> Self {
         Self::new(FINE, turn, [0.0; CAMERAS], [0.0; CAMERAS])
     }
@@ -188,7 +188,7 @@ fn clocks_that_are_frames_apart_are_found() {
 }
 
 #[test]
-fn poses_that_are_off_come_nearer_and_right_ones_stay() {
+fn wrong_poses_converge_and_correct_ones_stay() {
     // A pixel is 0.8 degrees wide: this is less than two.
     let line = &format!("iterations=1000 motion_order=1 densify.max_cap=200 refine.poses=true {SLOW}");
     let left = run(Disturbed::poses(0.015), line);
@@ -199,7 +199,7 @@ fn poses_that_are_off_come_nearer_and_right_ones_stay() {
 }
 
 #[test]
-fn focal_lengths_that_are_off_come_nearer_and_right_ones_stay() {
+fn wrong_focal_lengths_converge_and_correct_ones_stay() {
     let longer = [0.0, 0.04, -0.05, 0.03, 0.0, -0.04, 0.05];
     let line = "iterations=1000 motion_order=1 densify.max_cap=200 refine.focal=true";
     let left = run(Disturbed::lenses(longer), line);

@@ -8,13 +8,13 @@ use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
 use splat4d::layers::ALPHA_MIN;
 use splat4d::render::{
-    Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras, ResidentLayer,
-    ResidentNumbers, ResidentStep, ResidentStepped, Shot, Wanted,
+    Abilities, Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras,
+    ResidentLayer, ResidentNumbers, ResidentStep, ResidentStepped, Shot,
 };
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
 
-/// Recipes that stay on the device throughout: every kind of motion and of life.
+/// Recipes that stay on the device throughout: every kind of motion and of lifespan.
 const STAYS: [&str; 12] = [
     "motion=still strategy=adc sh_degree=3 sh_degree_interval=1",
     "motion=spacetime strategy=adc exposure=true antialias=true",
@@ -27,11 +27,13 @@ const STAYS: [&str; 12] = [
     "motion=native4d strategy=none sh_harmonics=2 sh_degree=3 sh_degree_interval=1 batch_size=2",
     "motion=native4d strategy=mcmc sh_harmonics=1 batch_size=2",
     "motion=tracked strategy=adc",
-    // Frame 1 from the second step on. Without what ties its poses to those of frame 0, of which they are copies at that step: there
-    // these losses are at their kinks, and a card's roundings alone decide which way they pull. `ties_pull_as_on_the_cpu` has them.
+    // Frame 1 from the second step on. Without what ties its poses to those of frame 0, of which they are copies at
+    // that step: there these losses are at their kinks, and a GPU's rounding alone decides their direction.
+    // `ties_pull_as_on_the_cpu` tests them.
     "motion=tracked strategy=none tracked.first_share=0.001 rigid_neighbours=5 tracked.rigid=0 tracked.rot=0 tracked.iso=0",
 ];
-/// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
+/// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be rendered by one side
+/// only.
 const GRADIENT: f64 = 5e-3;
 /// Largest relative difference of a statistic's sum: two of the fifty Gaussians of a tracked frame make 4 %.
 const STATISTICS: f64 = 5e-2;
@@ -101,7 +103,7 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
-                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are drawn by one side only.
+                // The CPU tests ellipses against bins, the GPU against tiles: a few are rendered by one side only.
                 assert!((a - b).abs() <= STATISTICS * b, "{line}: statistics {c}: {a} {b}");
             }
         }
@@ -172,7 +174,7 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     resumed.step().unwrap().unwrap();
 }
 
-/// What a device that fails states, and one that has no room.
+/// Errors of a failing device, and of one without memory.
 const GONE: &str = "the driver is gone";
 const FULL: &str = "too many for one buffer";
 /// As often as it is called.
@@ -215,7 +217,7 @@ impl Failing {
 }
 
 impl Backend for Failing {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         self.device.can(wanted)
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -251,7 +253,7 @@ impl Resident for Failing {
         cameras: Option<&ResidentCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()> {
-        // Want of room is no failure.
+        // Too little memory is not a failure.
         self.left[0] = self.left[0].checked_sub(1).ok_or_else(|| Error::new(ErrorKind::Unsupported, FULL))?;
         self.here()?.resident().expect("a GPU").keep(layers, cameras, corrections)
     }
@@ -289,7 +291,7 @@ fn a_failing_device_loses_only_steps_since_the_last_settle() {
         if left[1] == 0 {
             // The learner had everything: the CPU has taken the same step, and all that follow.
             notices.extend(finish(&mut trainer, "on the CPU").1);
-            assert_eq!(notices, [format!("training goes on on the CPU: {GONE}")]);
+            assert_eq!(notices, [format!("training continues on the CPU: {GONE}")]);
             assert!(bytes(trainer.scene()) == expected);
             continue;
         }
@@ -299,7 +301,7 @@ fn a_failing_device_loses_only_steps_since_the_last_settle() {
             _ => trainer.step().unwrap().expect_err("it is gone"),
         };
         assert!(fault.1 == Blame::Device && fault.0.contains(GONE), "{}", fault.0);
-        // What a run does then: back to a checkpoint, and on with the CPU, of which it said enough.
+        // The run then returns to a checkpoint and continues on the CPU.
         crate::run::checkpoint::read(&start, &mut trainer, &Default::default()).unwrap();
         let (_, notices) = finish(&mut trainer, "on the CPU");
         assert!(notices.is_empty() && bytes(trainer.scene()) == expected, "{notices:?}");

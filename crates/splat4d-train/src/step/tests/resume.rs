@@ -1,5 +1,5 @@
-//! A run of several stages, models with state of their own and losses with a memory continue from a checkpoint at any place
-//! as if nothing had been: the same bytes, on another number of threads.
+//! A run of several stages, models with state of their own and losses with a memory continue from a checkpoint at any
+//! step as if they had not been interrupted: the same bytes, with another number of threads.
 
 use super::bed::{Bed, bytes, saved, settings};
 
@@ -25,7 +25,7 @@ fn check(lines: &[&str]) {
         }
         assert_eq!(trainer.progress.iteration, trainer.iterations(), "{line}");
         let whole = bytes(trainer.scene());
-        // Every other one: what goes wrong goes wrong at more than one place.
+        // Every other one: an error would show at more than one step.
         for (iteration, checkpoint) in kept.iter().step_by(2) {
             let again = pool.install(|| {
                 let mut trainer = bed.resumed(&recipe, checkpoint);

@@ -85,7 +85,7 @@ fn unease(ran: &Ran) -> [f64; 2] {
 }
 
 #[test]
-fn losses_on_nodes_reduce_what_they_measure() {
+fn losses_on_nodes_reduce_their_value() {
     let bed = Bed::new();
     let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
     let plain = unease(&bed.run(base));
@@ -125,7 +125,7 @@ fn clones_get_a_time_of_their_own() {
         bed.watch(&format!("retime_clones={retime} percent_dense=1"), |trainer, change| {
             let p = &trainer.scene().layers[0].params;
             if change.added > 0 && change.removed == 0 && seen == 0 {
-                // Clones stand behind those that were there; no step has moved them yet.
+                // Clones are behind the existing rows; no step has moved them yet.
                 let centers: Vec<f32> = (0..p.len()).map(|r| p[LIFE].get(r, 0)).collect();
                 let (old, new) = centers.split_at(before);
                 assert_eq!(new.len(), change.added);
@@ -143,7 +143,7 @@ fn clones_get_a_time_of_their_own() {
 #[test]
 fn crowds_are_thinned_and_the_rest_learns() {
     let bed = Bed::new();
-    // Losses over neighbours look at the cloud after every thinning.
+    // Losses over neighbours use the cloud after every thinning.
     let losses = "lambda_rigid=1 lambda_jerk=0.1 lambda_velocity=0.1";
     for line in [
         "crowding=merge motion=spacetime",

@@ -98,7 +98,7 @@ fn searches_are_spread_over_the_run_and_keep_the_median_of_all_clocks() {
     assert_eq!(found.iter().map(|(_, d)| d.round).collect::<Vec<_>>(), (0..c.settings.searches).collect::<Vec<_>>());
     assert!(found[0].0 == 100 && found.iter().all(|(k, _)| *k < 500), "{found:?}");
     assert!((found[0].1.reach - 0.4).abs() < 1e-12 && found.last().unwrap().1.reach < 0.2, "far first: {found:?}");
-    // Places are passed over where the run was planned again: one search is made, and none twice.
+    // Replanning may skip search positions: one search is made, and none is repeated.
     assert_eq!(c.search_due(0.05, 0.44).map(|d| d.round), Some(6));
     assert_eq!(c.search_due(0.25, 0.25), None);
     // Four clocks that are right by themselves and one that is not.

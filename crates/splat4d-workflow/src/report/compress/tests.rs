@@ -95,7 +95,7 @@ fn the_section_shows_before_after_images_and_settings() {
 }
 
 #[test]
-fn a_plain_file_is_what_a_compressed_one_is_compared_with() {
+fn compressed_files_are_compared_with_plain_ones() {
     let mut told = told(Path::new("source"));
     told.plain = Some(side(150_000, 1_000_000, 31.0, 40.0));
     assert!(verdict(&told).contains("2.5 times smaller than the plain file"), "{}", verdict(&told));
@@ -106,7 +106,7 @@ fn a_plain_file_is_what_a_compressed_one_is_compared_with() {
 }
 
 #[test]
-fn what_is_missing_or_strange_costs_no_page() {
+fn missing_or_odd_values_do_not_fail_the_page() {
     let folder = tempfile::tempdir().unwrap();
     run(folder.path(), 90);
     assert_eq!(page(folder.path()), "", "a run that was not compressed");

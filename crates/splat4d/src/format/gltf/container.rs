@@ -21,7 +21,7 @@ const CHUNK: usize = 8;
 const ALIGN: usize = 4;
 /// Beginning of the data URI of a buffer, up to its media type.
 const DATA: &str = "data:";
-/// What stands before the bytes of a data URI.
+/// Prefix of a data URI.
 const BASE64: &str = ";base64,";
 /// Media type of buffers (glTF 2.0, 3.6.1.1).
 const MEDIA: &str = "data:application/octet-stream;base64,";
@@ -164,7 +164,7 @@ pub(super) fn buffers(text: &[u8]) -> Result<Vec<String>> {
 /// The bytes of a data URI.
 fn data(uri: &str) -> Result<Vec<u8>> {
     let (_, text) = uri.split_once(BASE64).ok_or_else(|| damaged("a data URI is not in base64"))?;
-    base64::decode(text.as_bytes()).ok_or_else(|| damaged("a data URI holds characters that base64 has not"))
+    base64::decode(text.as_bytes()).ok_or_else(|| damaged("a data URI contains characters outside base64"))
 }
 
 fn elsewhere(uri: &str) -> Error {

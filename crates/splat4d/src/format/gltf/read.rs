@@ -17,8 +17,8 @@ use std::collections::BTreeMap;
 const DEEPEST: usize = 64;
 /// Relative difference of the scales of a node's axes that count as one.
 const UNIFORM: f64 = 1e-4;
-/// Gaussians that nodes may place in any case; more only with a byte of the file for each. A file may show one mesh often,
-/// but 1 MB must not become 100 GB.
+/// Gaussians that nodes may place in any case; more only with a byte of the file for each. A file may show one mesh
+/// often, but 1 MB must not become 100 GB.
 const ALWAYS: usize = 1 << 16;
 
 /// Reads a .gltf with the files that [`buffers_of`] names. Errors: damaged, a file is missing, no Gaussians.
@@ -120,7 +120,7 @@ impl File<'_> {
         Ok((buffer.get(begin..end).ok_or_else(outside)?, index(&view["byteStride"])))
     }
 
-    /// Meshes and where the default scene's nodes place them; all meshes as they are where there are no nodes.
+    /// Meshes and where the default scene's nodes place them; all meshes unplaced where there are no nodes.
     fn placed(&self) -> Result<Vec<(usize, Sim3)>> {
         let nodes = self.json["nodes"].as_array().map_or(&[][..], Vec::as_slice);
         let scene = &self.json["scenes"][index(&self.json["scene"]).unwrap_or(0)]["nodes"];
@@ -146,7 +146,7 @@ impl File<'_> {
         Ok(out)
     }
 
-    /// The Gaussians of a primitive; scales and opacities are as they are stored.
+    /// The Gaussians of a primitive; scales and opacities as stored.
     fn gaussians(&self, attributes: &Value) -> Result<Params> {
         let of = |name: &str| &attributes[format!("{EXTENSION}:{name}")];
         let means = self.numbers(&attributes["POSITION"], 3, "POSITION", usize::MAX)?;
@@ -225,14 +225,14 @@ impl File<'_> {
     }
 }
 
-/// Says something that several meshes may share.
+/// Adds a remark that several meshes may share.
 fn warnings_once(warnings: &mut Warnings, text: Option<String>) {
     let mut one = Warnings::default();
-    text.into_iter().for_each(|text| one.say(text));
+    text.into_iter().for_each(|text| one.add(text));
     warnings.append(one);
 }
 
-/// Where a node stands in the one above. Errors: axes of different scale, mirrors.
+/// Placement of a node in its parent. Errors: axes of different scale, mirrors.
 fn placement(node: &Value) -> Result<Sim3> {
     let numbers = |key: &str, count: usize| -> Option<Vec<f64>> {
         let list = node[key].as_array().filter(|l| l.len() == count)?;

@@ -38,7 +38,7 @@ fn changed(params: &Params, change: impl Fn(&mut Value)) -> Result<Opened> {
 }
 
 #[test]
-fn gaussians_come_back_from_both_containers() {
+fn gaussians_round_trip_in_both_containers() {
     let p = gaussians(60, 16);
     for dialect in [DIALECT, TEXT] {
         let opened = dialect.open(&written(dialect, &p)).unwrap();

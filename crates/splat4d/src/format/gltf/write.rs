@@ -12,7 +12,7 @@ use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
 
-/// Points (glTF 2.0, 3.7.2.1): what programs without the extension draw.
+/// Points (glTF 2.0, 3.7.2.1): what programs without the extension render.
 const POINTS: u32 = 0;
 /// Target of buffer views of attributes (glTF 2.0, 5.11.5).
 const ARRAY_BUFFER: u32 = 34962;
@@ -31,7 +31,7 @@ struct Mesh {
 }
 
 impl Mesh {
-    /// Adds an attribute of `width` f32 a Gaussian.
+    /// Adds an attribute of `width` f32 per Gaussian.
     fn floats<const N: usize>(&mut self, name: &str, values: impl Iterator<Item = [f32; N]>) {
         let begin = self.bytes.len();
         values.for_each(|v| v.iter().for_each(|x| self.bytes.extend(x.to_le_bytes())));
@@ -120,11 +120,11 @@ pub(super) fn plain(params: &Params) -> Result<(File<'static>, Warnings)> {
     Ok((mesh.file(json!({"kernel": ELLIPSE, "colorSpace": SRGB}), &[]), warnings))
 }
 
-/// Gaussians as an .spz of version 2. The draft gives its numbers the axes of the file, and maps them to attributes that
-/// have accessors without bytes. Errors: there are none.
+/// Gaussians as an .spz of version 2. The draft gives its numbers the axes of the file, and maps them to attributes
+/// that have accessors without bytes. Errors: there are none.
 pub(super) fn compressed(params: &Params) -> Result<(File<'static>, Warnings)> {
     let mut bytes = Vec::new();
-    // Version 2 names no axes: those of .ply draw no remark.
+    // Version 2 names no axes: those of .ply cause no remark.
     let warnings = spz::write(params, SPZ_VERSION, Y_DOWN, &mut bytes)?;
     let (decoded, ..) = spz::read(&bytes)?;
     let mut mesh = Mesh { count: decoded.len(), ..Mesh::default() };

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 pub(super) const NO_WIDTH: f64 = 0.02;
 /// Shortest softness, seconds: a hundredth of a frame at 100 frames a second.
 pub(super) const SHARPEST: f64 = 1e-4;
-/// Share by which a block's life is stretched, so that a reader in f32 does not cull what it would draw.
+/// Share by which a block's life is stretched, so that a reader in f32 does not cull what it would render.
 const SLACK: f64 = 1e-6;
 
 /// One number of every Gaussian of a block.
@@ -29,7 +29,7 @@ pub(super) struct Columns {
     pub mean: [Column; 3],
     /// Seconds.
     pub center: Column,
-    /// Logarithm of the half-width (s): −∞ for zero, +∞ for ever.
+    /// Logarithm of the half-width (s): −∞ for zero, +∞ forever.
     pub log_width: Column,
     /// Logarithm of the softness (s).
     pub log_softness: Column,
@@ -39,7 +39,7 @@ pub(super) struct Columns {
     pub log_scales: [Column; 3],
     /// 0 to 1.
     pub opacity: Column,
-    /// Scene units a second.
+    /// Scene units per second.
     pub velocity: [Column; 3],
     /// Radians a second about the world's axes.
     pub turn: [Column; 3],
@@ -54,7 +54,7 @@ pub(super) struct Columns {
 /// The words of a block, word by word: word k of Gaussian i is [k][i]; zero behind the last Gaussian.
 pub(super) type Words = [[u32; BLOCK_GAUSSIANS]; PAGE_WORDS];
 
-/// Words Gaussian by Gaussian, as a page has them. `rows` are at most a block.
+/// Words Gaussian by Gaussian, as in a page. `rows` are at most a block.
 #[inline(always)]
 pub(super) fn turn_over(words: &Words, rows: &mut [[u32; PAGE_WORDS]]) {
     for (i, row) in rows.iter_mut().enumerate() {
@@ -257,12 +257,12 @@ impl Columns {
     }
 
     /// Life first: mean and rotation are evaluated at the centre that a reader will see, and the reach of the motion
-    /// follows from the life that a reader will see.
+    /// follows from the lifespan that a reader will see.
     #[inline(always)]
     fn encode_life(&mut self, span: [f64; 2], depths: &Depths, h: &mut Header, words: &mut Words) {
         let n = self.rows;
-        // From the middle of the span the reach is shortest. A turn keeps its own centre: normalize(q₀ + ½Δ(0, ω)⊗q₀) is
-        // fastest there, and no other centre gives the same motion.
+        // From the middle of the span the reach is shortest. A turn keeps its own centre: normalize(q₀ + ½Δ(0, ω)⊗q₀)
+        // is fastest there, and no other centre gives the same motion.
         for i in 0..n {
             let still = self.turn[0][i] == 0.0 && self.turn[1][i] == 0.0 && self.turn[2][i] == 0.0;
             if self.log_width[i] == f64::INFINITY && still {

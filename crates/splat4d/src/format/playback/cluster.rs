@@ -1,9 +1,9 @@
 //! Weighted k-means for palettes, in two levels so that thousands of entries take seconds: coarse clusters first, then
-//! each is divided by itself, and finally every point searches the coarse clusters nearest to it for its entry.
+//! each is divided alone, and finally every point searches the coarse clusters nearest to it for its entry.
 //!
-//! Identical points are merged into one with the sum of their weights first: the segments of a Gaussian share its colours.
-//! Points are assigned in parallel, and every cluster is summed in the order of its points: any number of threads gives the
-//! same bits.
+//! Identical points are merged into one with the sum of their weights first: the segments of a Gaussian share its
+//! colours. Points are assigned in parallel, and every cluster is summed in the order of its points: any number of
+//! threads gives the same bits.
 
 use crate::math::Rng;
 use rayon::prelude::*;
@@ -32,8 +32,8 @@ pub(in crate::format) struct Clusters {
     pub labels: Vec<u32>,
 }
 
-/// Divides `points` into at most `k` clusters that minimise Σ weight·distance². Weights are positive. Memory: that of the
-/// points that differ.
+/// Divides `points` into at most `k` clusters that minimise Σ weight·distance². Weights are positive. Memory: that of
+/// the points that differ.
 ///
 /// Panics: no point, k = 0, or lengths that do not fit.
 pub(in crate::format) fn cluster<'a>(
@@ -62,7 +62,7 @@ pub(in crate::format) fn cluster<'a>(
     }
 }
 
-/// Points that differ, in the order in which each first came.
+/// Distinct points, in the order of their first occurrence.
 struct Merged {
     /// [points, stride], padded with zeros.
     data: Vec<f32>,
@@ -168,7 +168,8 @@ impl Set<'_> {
         parts.concat()
     }
 
-    /// Lloyd's rounds. Starts from points drawn by weight; a cluster that runs empty moves to the point that is worst off.
+    /// Lloyd's rounds. Starts from points drawn by weight; a cluster that runs empty moves to the point with the
+    /// largest error.
     fn lloyd(&self, ids: &[u32], k: usize, rounds: usize, rng: Rng) -> Level {
         let k = k.min(ids.len());
         // Drawing by weight without replacement: the largest of ln(u)/w (Efraimidis, Spirakis 2006).
@@ -233,7 +234,7 @@ impl Set<'_> {
         let find = |&id: &u32| {
             let x = self.point(id);
             let score = |c: usize| dot(x, &coarse.centroids[c * self.stride..(c + 1) * self.stride]) - half_coarse[c];
-            // The best few so far, best first; of equals the first stays before the later one.
+            // The best few, best first; of equals the first stays before the later one.
             let mut near = [(f32::NEG_INFINITY, usize::MAX); NEAREST];
             for c in 0..count {
                 let score = score(c);
@@ -361,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn heavy_points_are_served_better() {
+    fn heavy_points_get_smaller_errors() {
         let points = clouds(3000, 9, 3000, 0.0);
         let weights: Vec<f32> = (0..3000).map(|i| if i < 300 { 50.0 } else { 1.0 }).collect();
         let c = cluster(&points, 9, &weights, 400, 6, Rng::new(1, "k", 0));

@@ -1,5 +1,5 @@
-//! Layers of pages as a reader would see them, without the way through a file: for training against the numbers
-//! that will be drawn (straight-through quantisation).
+//! Layers of pages as a reader decodes them, without a file: for training against the numbers that will be rendered
+//! (straight-through quantisation).
 
 use super::block::Words;
 use super::layer::{TABLES, columns, decode, keys, paint};
@@ -18,9 +18,10 @@ pub struct Coder {
 }
 
 impl Coder {
-    /// Writes into `shown` what a reader would see of `layer`, a page whose rows are in the file's order: of the blocks of
-    /// 256 rows for which `wanted` holds; other rows stay as they are. A block's ranges are those of all its rows. Above
-    /// degree 0 colours are those of the palette's entries `labels`; without a palette they stay, and `labels` may be empty.
+    /// Writes into `shown` what a reader would see of `layer`, a page whose rows are in the file's order: of the blocks
+    /// of 256 rows for which `wanted` holds; other rows are not changed. A block's ranges are those of all its rows.
+    /// Above degree 0 colours are those of the palette's entries `labels`; without a palette they stay, and `labels`
+    /// may be empty.
     ///
     /// Parallel over blocks; the same bits for any number of threads. Panics: a layer that is none that a page gives,
     /// another shape of `shown`, a label beyond the palette, depths out of range.
@@ -91,7 +92,7 @@ impl Kernel for Encode<'_> {
     }
 }
 
-/// Rows there and back.
+/// Rows encoded and decoded.
 struct Show<'a, 'b> {
     source: Rows<'a>,
     depths: &'a Depths,

@@ -1,8 +1,8 @@
-//! Deflates byte planes one by one: each gets codes of its own, and the way of searching for repetitions that suits it.
+//! Deflates byte planes one by one: each gets its own codes and the search for repetitions that suits it.
 //!
-//! Planes of one section differ: the low bits of positions are noise, a label's high byte is nearly constant. One encoder
-//! over all of them begins blocks anywhere; blocks that begin with planes made the pages of the bundled capture 4 % and
-//! coarse ones 17 % smaller. To a reader it is one stream like any other (RFC 1951).
+//! Planes of one section differ: the low bits of positions are noise, a label's high byte is nearly constant. One
+//! encoder over all of them begins blocks anywhere; blocks that begin with planes made the pages of the bundled capture
+//! 4 % and coarse ones 17 % smaller. To a reader it is one stream like any other (RFC 1951).
 
 use miniz_oxide::deflate::core::{
     CompressionStrategy, CompressorOxide, TDEFLFlush, TDEFLStatus, compress_to_output,
@@ -20,8 +20,8 @@ const STRATEGIES: [CompressionStrategy; 4] = [
     CompressionStrategy::RLE,
 ];
 
-/// One raw deflate stream of `body`: its first `head` bytes, then runs of `run` bytes each, every one in blocks of its own.
-/// `level` is 0 to 10, 0 the fastest.
+/// One raw deflate stream of `body`: its first `head` bytes, then runs of `run` bytes each, every one in blocks of its
+/// own. `level` is 0 to 10, 0 the fastest.
 pub(super) fn deflate(body: &[u8], head: usize, run: usize, level: u32) -> Vec<u8> {
     let (first, rest) = body.split_at(head.min(body.len()));
     let mut parts: Vec<&[u8]> = if first.is_empty() { Vec::new() } else { vec![first] };

@@ -6,13 +6,14 @@ use crate::{Error, Result};
 /// Fewest bits of a code: one step to either side of a middle needs two.
 pub(crate) const LEAST_DEPTH: u32 = 2;
 
-/// Bits that the writer uses of the codes of docs/format.md, "Page"; what is below them carries nothing, so that deflate
-/// removes it. A reader need not know: ranges are stretched a little, so that the largest code in use is their end.
+/// Bits that the writer uses of the codes of docs/format.md, "Page"; what is below them carries nothing, so that
+/// deflate removes it. Readers are not affected: ranges are stretched a little, so that the largest code in use is
+/// their end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Depths {
     /// Of 16, each axis of the mean.
     pub position: u32,
-    /// Of 16, the centre of the life.
+    /// Of 16, the centre of the lifespan.
     pub center: u32,
     /// Of 8, each scale.
     pub scale: u32,
@@ -26,7 +27,7 @@ pub struct Depths {
     pub turn: u32,
     /// Of 8, each channel of the base colour.
     pub color: u32,
-    /// Of 8, half-width and softness of the life.
+    /// Of 8, half-width and softness of the lifespan.
     pub life: u32,
 }
 

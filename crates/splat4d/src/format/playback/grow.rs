@@ -1,6 +1,6 @@
-//! Files of clips that are not finished: sections are appended, and a new index behind them; then the header names the new
-//! index. A reader of the old header continues with the old index, of which nothing was touched. What is finished is written
-//! again as any other file, its index in front.
+//! Files of clips that are not finished: sections are appended, and a new index behind them; then the header names the
+//! new index. A reader of the old header continues with the old index, of which nothing was touched. What is finished
+//! is written again as any other file, its index in front.
 
 use super::index::broken;
 use super::write::GENERATOR;
@@ -27,7 +27,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         Ok(growing)
     }
 
-    /// Goes on with a file. Errors: it is no file that grows, or damaged; the file's.
+    /// Continues a file. Errors: not a growing file, or damaged; those of the file.
     pub fn open(mut file: F) -> Result<Self> {
         let index = read_index(&mut file)?;
         if index.version[0] != GROWING[0] {
@@ -36,7 +36,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         Ok(Self { file, index })
     }
 
-    /// What it holds so far.
+    /// Its present content.
     pub fn index(&self) -> &Index {
         &self.index
     }
@@ -47,10 +47,12 @@ impl<F: Read + Write + Seek> Growing<F> {
         &mut self.file
     }
 
-    /// Adds the pages of a whole playback file, their palettes, masks and labels, and states `meta`, of which `gaussians` is counted.
-    /// `sync` is called before the header names what was added: until then the file is what it was.
+    /// Adds the pages of a whole playback file, their palettes, masks and labels, and states `meta`, of which
+    /// `gaussians` is counted. `sync` is called before the header names what was added: until then the file is what it
+    /// was.
     ///
-    /// Errors: `part` is no whole file; metadata out of range; the file's. After an error the file is what it was.
+    /// Errors: `part` is not a complete file; metadata out of range; the file's. After an error the file is what it
+    /// was.
     pub fn append(
         &mut self,
         part: &[u8],
@@ -69,7 +71,7 @@ impl<F: Read + Write + Seek> Growing<F> {
     fn add(&mut self, part: &[u8], meta: Meta, sync: &mut dyn FnMut(&mut F) -> std::io::Result<()>) -> Result<()> {
         let theirs = Index::parse(part, Some(part.len() as u64))?;
         let wanted = |e: &&Entry| matches!(e.kind, Kind::Page | Kind::Palette | Kind::Masks | Kind::Labels);
-        // Sections are named by their places, which change.
+        // Sections are named by their positions, which change.
         let mut places = vec![0u32; theirs.sections.len()];
         let mut next = self.index.sections.len() as u32;
         for (place, e) in places.iter_mut().zip(&theirs.sections) {
@@ -101,16 +103,16 @@ impl<F: Read + Write + Seek> Growing<F> {
         self.put(&header)
     }
 
-    /// Writes the header in one go.
+    /// Writes the header at once.
     fn put(&mut self, header: &[u8; HEADER_BYTES]) -> Result<()> {
         self.file.seek(SeekFrom::Start(0)).map_err(unwritten)?;
         self.file.write_all(header).and_then(|()| self.file.flush()).map_err(unwritten)
     }
 }
 
-/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player wants them,
-/// whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in [`write()`](super::write()).
-/// Returns the file's length, bytes.
+/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player needs
+/// them, whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in
+/// [`write()`](super::write()). Returns the file's length, bytes.
 ///
 /// Errors: `source` does not grow, or is damaged or cut short; metadata out of range; either file's.
 pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>, out: &mut dyn Write) -> Result<u64> {
@@ -147,10 +149,9 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
     Ok(index.file_len)
 }
 
-/// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time goes on.
-/// Palettes
-/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by their bytes, so that who added
-/// what when does not show.
+/// Sections of the first image: the first tier of its pages, what colours them, the rest of them; then time continues.
+/// Palettes come before the first page that names them, masks behind their page, labels behind everything. Equal ones
+/// are ordered by their bytes, so that the order of additions does not change the file.
 fn order(index: &Index) -> Vec<usize> {
     let start = index.meta.clip[0];
     let holds = |e: &Entry| e.span[0] <= start && start < e.span[1];
@@ -190,7 +191,7 @@ fn order(index: &Index) -> Vec<usize> {
     order
 }
 
-/// The index of a file, wherever it lies. Errors: not a playback file, damage, the file's.
+/// The index of a file, at any position. Errors: not a playback file, damage, those of the file.
 fn read_index(file: &mut (impl Read + Seek)) -> Result<Index> {
     let mut header = [0; HEADER_BYTES];
     file.seek(SeekFrom::Start(0)).and_then(|_| file.read_exact(&mut header)).map_err(unread)?;

@@ -22,7 +22,7 @@ pub(super) const NO_PALETTE: u32 = u32::MAX;
 /// Bytes of masks before their key times, and most of these (docs/format.md, "Masks").
 pub(super) const MASK_HEAD: usize = 8;
 pub(super) const MAX_KEYS: usize = 65_535;
-/// Flag of an entry: who does not know the kind refuses the file.
+/// Flag of an entry: readers that do not support the kind refuse the file.
 const REQUIRED: u32 = 1;
 
 /// The kind of a section.
@@ -34,13 +34,13 @@ pub enum Kind {
     Palette,
     /// Which Gaussians of a page are rendered when.
     Masks,
-    /// What the Gaussians of a page are part of.
+    /// Labels of the Gaussians of a page.
     Labels,
     /// Feature channels of the Gaussians of a page.
     Features,
     /// An image.
     Poster,
-    /// Where the file comes from.
+    /// The file's provenance.
     Provenance,
     /// Something newer, which is skipped.
     Other([u8; 4]),
@@ -93,12 +93,12 @@ impl Codec {
     }
 }
 
-/// One section, as the table has it.
+/// One section of the table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
     /// Kind of its contents.
     pub kind: Kind,
-    /// Whether who does not know the kind must refuse the file.
+    /// Whether readers that do not support the kind must refuse the file.
     pub required: bool,
     /// First byte in the file.
     pub offset: u64,
@@ -116,11 +116,11 @@ pub struct Entry {
     pub degree: u16,
     /// Page: Gaussians. Palette: entries. Masks, labels, features: Gaussians of their page.
     pub count: u32,
-    /// Page: it is drawn for from ≤ t < to, seconds. Masks: first and last key time.
+    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
-    /// Page: place of its palette in the table of sections; none: base colour only.
+    /// Page: position of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
-    /// Masks, labels, features: place of their page in the table of sections.
+    /// Masks, labels, features: position of their page in the table of sections.
     pub page: Option<u32>,
 }
 
@@ -133,14 +133,14 @@ pub struct Index {
     pub file_len: u64,
     /// The JSON.
     pub meta: Meta,
-    /// All sections in the order in which a player wants them.
+    /// All sections in the order in which a player needs them.
     pub sections: Vec<Entry>,
 }
 
 /// The fixed header.
 struct Header {
     version: [u16; 2],
-    /// Where the index lies: behind the header, but in files that grow.
+    /// Position of the index: behind the header, except in growing files.
     index_at: u64,
     index_bytes: usize,
     file_len: u64,
@@ -148,8 +148,9 @@ struct Header {
 }
 
 impl Index {
-    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number. Of a
-    /// file that grows that is nearly all of it: a reader with random access uses its [`place`](Self::place).
+    /// Bytes from the start that [`parse`](Self::parse) needs: 64 as long as `prefix` is shorter, then the exact
+    /// number. Of a file that grows that is nearly all of it: a reader with random access uses its
+    /// [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn needed(prefix: &[u8]) -> Result<usize> {
@@ -160,12 +161,12 @@ impl Index {
         Ok(Self::place(prefix)?.end as usize)
     }
 
-    /// Whether a file's first bytes say that it is of a clip that is not finished.
+    /// Whether a file's first bytes mark its clip as unfinished.
     pub fn grows(header: &[u8]) -> bool {
         header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
     }
 
-    /// The bytes of the file in which its index lies, by its first [`HEADER_BYTES`].
+    /// The bytes of the file that contain its index, by its first [`HEADER_BYTES`].
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn place(header: &[u8]) -> Result<Range<u64>> {
@@ -176,8 +177,8 @@ impl Index {
         Ok(header.index_at..header.index_at + header.index_bytes as u64)
     }
 
-    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`, where
-    /// it is known, is how long the file really is: a shorter one is cut short, which is no error here.
+    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`,
+    /// where it is known, is how long the file really is: a shorter one is cut short, which is no error here.
     ///
     /// Errors: not a playback file, a newer major version, damage, a required section of an unknown kind.
     pub fn parse(prefix: &[u8], file_len: Option<u64>) -> Result<Self> {
@@ -200,8 +201,7 @@ impl Index {
         }
         let json_len = read_u32(index, 0).ok_or_else(short)? as usize;
         let json = index.get(4..).and_then(|rest| rest.get(..json_len)).ok_or_else(short)?;
-        let meta: Meta =
-            serde_json::from_slice(json).map_err(|e| broken(format!("its JSON is not what it must be: {e}")))?;
+        let meta: Meta = serde_json::from_slice(json).map_err(|e| broken(format!("its JSON is invalid: {e}")))?;
         meta.check()?;
         let rest = &index[4 + json_len..];
         let count = read_u32(rest, 0).ok_or_else(short)? as usize;
@@ -217,8 +217,8 @@ impl Index {
         Ok(index)
     }
 
-    /// The pages (with their places in the table) that are drawn at second t, most important tier first. Clamps t to the
-    /// clip.
+    /// The pages (with their positions in the table) that are rendered at second t, most important tier first. Clamps t
+    /// to the clip.
     pub fn pages_at(&self, t: f64) -> Vec<(usize, &Entry)> {
         let t = t.max(self.meta.clip[0]).min(self.meta.clip[1]);
         let mut pages: Vec<_> = self.pages().filter(|(_, e)| e.span[0] <= t && t < e.span[1]).collect();
@@ -226,7 +226,7 @@ impl Index {
         pages
     }
 
-    /// All pages with their places in the table.
+    /// All pages with their positions in the table.
     pub(crate) fn pages(&self) -> impl Iterator<Item = (usize, &Entry)> {
         self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Page)
     }
@@ -319,8 +319,8 @@ impl Index {
         [&self.header(HEADER_BYTES as u64, &index)[..], &index].concat()
     }
 
-    /// The start of a file that grows, and its index, which is to be behind everything else, `at`; sections stay where they
-    /// are. Panics: as [`bytes`](Self::bytes).
+    /// The start of a file that grows, and its index, which is to be behind everything else, `at`; sections stay where
+    /// they are. Panics: as [`bytes`](Self::bytes).
     pub(super) fn growing(&mut self, at: u64, generator: &str) -> ([u8; HEADER_BYTES], Vec<u8>) {
         let index = self.table(&self.json(generator));
         (self.version, self.file_len) = (GROWING, at + index.len() as u64);
@@ -348,7 +348,7 @@ impl Index {
         out
     }
 
-    /// The header of a file whose index lies `at`.
+    /// The header of a file whose index is at `at`.
     fn header(&self, at: u64, index: &[u8]) -> [u8; HEADER_BYTES] {
         let mut out = [0; HEADER_BYTES];
         out[..8].copy_from_slice(&MAGIC);
@@ -366,7 +366,8 @@ impl Index {
     }
 }
 
-/// Writes both checksums of a file's start, whose index is behind its header. Panics: fewer bytes than header and index have.
+/// Writes both checksums of a file's start, whose index is behind its header. Panics: fewer bytes than header and index
+/// have.
 #[cfg(test)]
 pub(super) fn seal(file: &mut [u8]) {
     let index_bytes = read_u32(file, 12).expect("a header") as usize;
@@ -383,7 +384,7 @@ impl Header {
             return Err(foreign());
         }
         let [major, minor] = [8, 10].map(|at| u16::from_le_bytes([bytes[at], bytes[at + 1]]));
-        // Asked first: a newer format may have another header behind these bytes.
+        // Checked first: a newer format may have another header behind these bytes.
         if major != VERSION[0] && major != GROWING[0] {
             return Err(Error::new(
                 ErrorKind::Unsupported,
@@ -410,7 +411,7 @@ impl Header {
 }
 
 impl Entry {
-    /// An optional section of these bytes as they are, wherever it will be.
+    /// An optional section of exactly these bytes, at any position.
     pub(super) fn plain(kind: Kind, bytes: &[u8]) -> Self {
         let length = u32::try_from(bytes.len()).expect("a section has less than 4 GiB");
         Self {
@@ -563,7 +564,7 @@ pub(super) fn palette_bytes(degree: usize, entries: usize) -> usize {
     12 + 3 * (sh::coeffs(degree) - 1) * entries
 }
 
-/// Key times of the masks of so many Gaussians, whose decoded bytes are so many; none where no number fits.
+/// Key times of the masks of this many Gaussians, whose decoded bytes are this many; none where no number fits.
 pub(super) fn mask_keys(gaussians: usize, bytes: usize) -> Option<usize> {
     let (rest, key) = (bytes.checked_sub(MASK_HEAD)?, 8 + gaussians.div_ceil(8));
     (rest.is_multiple_of(key) && (1..=MAX_KEYS).contains(&(rest / key))).then_some(rest / key)

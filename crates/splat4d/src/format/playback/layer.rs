@@ -1,4 +1,5 @@
-//! A page as a layer of a scene, so that everything that draws scenes draws playback files; and such a layer as a page.
+//! A page as a layer of a scene, so that everything that renders scenes renders playback files; and such a layer as a
+//! page.
 
 use super::block::{Columns, NO_WIDTH, SHARPEST, Words, encode_page};
 use super::index::broken;
@@ -19,13 +20,14 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::ops::Range;
 use std::sync::{Arc, LazyLock};
 
-/// Half-width of Gaussians that live for ever, seconds: thirty years, in whose middle f32 is exact.
+/// Half-width of Gaussians that have infinite lifespans, seconds: thirty years, in whose middle f32 is exact.
 const FOR_EVER: f64 = 1e9;
-/// Half-width zero as a logarithm can say it, seconds: less than any frame notices.
+/// Half-width zero as a logarithm can express it, seconds: far less than a frame.
 const INSTANT: f64 = 1e-9;
 /// A half-width in a layer counts as one of those two within this factor: an f32 logarithm is not exact.
 const ABOUT: f64 = 1.001;
-/// Opacities 0 and 255 are this far from 0 and 1, where logits are infinite: invisible, and above the renderer's ceiling.
+/// Opacities 0 and 255 are this far from 0 and 1, where logits are infinite: invisible, and above the renderer's
+/// ceiling.
 const OPACITY_MARGIN: f64 = 1e-4;
 /// Largest velocity and rate that a layer holds: far beyond any scene, and finite in f32 when times are multiplied.
 const FASTEST: f64 = 1e15;
@@ -34,7 +36,7 @@ const FASTEST: f64 = 1e15;
 struct Constants {
     /// By code of the opacity: its logit.
     logits: [f32; 1 << FULL8],
-    /// Logarithms of the half-widths zero and for ever.
+    /// Logarithms of the half-widths zero and infinity.
     instant: f64,
     for_ever: f64,
     /// Logarithms of what the encoder compares with.
@@ -64,13 +66,13 @@ fn constants() -> &'static Constants {
 /// Tables of a page's layer, in the order in which [`keys`] names them.
 pub(super) const TABLES: usize = 5;
 
-/// Geometry, colours, lives, velocities, rotation rates. Panics: the layer is none that a page gives.
+/// Geometry, colours, lifespans, velocities, rotation rates. Panics: the layer is none that a page gives.
 pub(super) fn keys(layer: &Layer<f32>) -> [Key; TABLES] {
     let found = page_keys(layer);
     found.unwrap_or_else(|| panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"))
 }
 
-/// Whether a page could hold the layer as it is: its Gaussians are primitives already.
+/// Whether a page could hold the layer exactly: its Gaussians are already primitives.
 pub(crate) fn is_page(layer: &Layer<f32>) -> bool {
     page_keys(layer).is_some() && layer.span.iter().all(|t| t.is_finite())
 }
@@ -87,7 +89,7 @@ fn page_keys(layer: &Layer<f32>) -> Option<[Key; TABLES]> {
 }
 
 impl Page {
-    /// The page as a layer that is seen during its span; coefficients come from its palette, where it has one.
+    /// The page as a layer that is visible during its span; coefficients come from its palette, where it has one.
     ///
     /// Errors: a Gaussian's label is not in the palette. Panics: the page has a palette and none is given.
     pub(crate) fn layer(&self, palette: Option<&Palette>) -> Result<Layer<f32>> {
@@ -200,7 +202,7 @@ pub(super) fn decode(
         let logits = each(|l| f64::from(constants.logits[(word[2][l] >> 24) as usize]));
         store(geometry, row, OPACITY, count, logits);
 
-        // The life, and the reach that follows from it.
+        // The lifespan, and the reach that follows from it.
         store(lives, row, CENTER, count, sixteen(&word[1], 16, range(at::CENTER, 1)));
         let log_softness = eight(&word[7], 16, range(at::SOFTNESS, 1));
         store(lives, row, LOG_SOFTNESS, count, log_softness);
@@ -346,9 +348,10 @@ fn angular([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 3] {
     ]
 }
 
-/// The Gaussians of a page's layer as primitives: the inverse of [`Page::layer`], in the layer's order. Importance is 1.
+/// The Gaussians of a page's layer as primitives: the inverse of [`Page::layer`], in the layer's order. Importance is
+/// 1.
 ///
-/// Panics: the layer moves or lives otherwise than those of a page.
+/// Panics: the layer's motion or lifespan is not that of a page.
 pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;
@@ -385,8 +388,8 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     (0..p.len()).map(one).collect()
 }
 
-/// Nodes as layers in their base colours, as the default depths hold them, and of each layer its node and the place of its
-/// first row in that.
+/// Nodes as layers in their base colours, as the default depths hold them, and of each layer its node and the position
+/// of its first row in that.
 pub(crate) fn as_layers(nodes: &[Node]) -> (Vec<Layer<f32>>, Vec<(usize, usize)>) {
     let (mut layers, mut places) = (Vec::new(), Vec::new());
     for (i, node) in nodes.iter().enumerate() {

@@ -39,7 +39,7 @@ fn parse(bytes: &[u8], entry: &Entry) -> Result<KeyMasks> {
             *last &= !(!0 << (rows % WORD));
         }
     }
-    Ok(KeyMasks::from_words(times, rows, words).expect("as many words as the size says, none with a spare bit"))
+    Ok(KeyMasks::from_words(times, rows, words).expect("as many words as the size states, none with a spare bit"))
 }
 
 /// The decoded bytes. Errors: more key times than a file holds.

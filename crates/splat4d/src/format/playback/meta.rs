@@ -7,7 +7,7 @@ use crate::scene::{Camera, Intrinsics, Lens, labels};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// About the scene, as the file's JSON has it. Seconds, scene units, world axes as captured.
+/// Metadata of the scene, from the file's JSON. Seconds, scene units, world axes as captured.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Meta {
     /// First and last second.
@@ -55,12 +55,12 @@ pub struct Meta {
     /// Of a file that grows: the parts that are in it, as their maker names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parts: Vec<String>,
-    /// Of a file that grows: spans of the clip, seconds, of which only what all parts share is there so far.
+    /// Of a growing file: spans of the clip, seconds, of which only the part shared by all is present yet.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub missing: Vec<[f64; 2]>,
 }
 
-/// A place to look from.
+/// A viewpoint.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Viewpoint {
     /// The eye.
@@ -92,7 +92,7 @@ pub struct NamedCamera {
     pub cx: f64,
     /// Principal point, pixels.
     pub cy: f64,
-    /// Nothing as near as this or nearer is drawn, scene units; readers that do not know it draw a little more.
+    /// Nothing as near as this or nearer is rendered, scene units; readers without support for it render a little more.
     #[serde(default = "nothing_nearer")]
     pub near: f64,
 }
@@ -127,7 +127,7 @@ pub struct PathKey {
     pub up: [f64; 3],
     /// Vertical field of view, degrees.
     pub fov_y: f64,
-    /// Second of the scene; none: time goes on by itself.
+    /// Second of the scene; none: time runs.
     #[serde(default)]
     pub time: Option<f64>,
 }
@@ -146,7 +146,7 @@ impl NamedCamera {
         Self { name, world_from_camera: std::array::from_fn(cell), width, height, fx, fy, cx, cy, near }
     }
 
-    /// As the renderer wants it; none where the numbers are no camera.
+    /// For the renderer; none where the numbers are no camera.
     pub fn camera(&self) -> Option<Camera> {
         let m = &self.world_from_camera;
         let world = Se3 {
@@ -168,7 +168,7 @@ impl NamedCamera {
 }
 
 impl Meta {
-    /// Refuses what no reader could draw. Errors: the first field that is out of range, by name.
+    /// Refuses what no reader could render. Errors: the first field that is out of range, by name.
     pub(super) fn check(&self) -> Result<()> {
         let wrong = |what: &str| Err(Error::input(format!("the playback file's {what}")));
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());

@@ -1,8 +1,8 @@
 //! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
-//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section by itself, and
-//! [`read()`] a whole file as a scene of one layer per page.
+//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section alone, and [`read()`] a
+//! whole file as a scene of one layer per page.
 
 mod block;
 pub(in crate::format) mod cluster;
@@ -54,7 +54,7 @@ pub const OLD_EXTENSION: &str = "splat4d";
 pub const MEDIA_TYPE: &str = "application/vnd.s4d";
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
-/// The version that this library knows: major, minor. A file states the least that has all it holds.
+/// The version of this library: major, minor. A file states the lowest version that has all of its content.
 pub(crate) const VERSION: [u16; 2] = [1, 2];
 /// The version of a file with masks and without labels.
 const MASKED: [u16; 2] = [1, 1];
@@ -83,19 +83,19 @@ const ALPHA_MIN: f64 = crate::layers::ALPHA_MIN;
 pub struct Primitive {
     /// Mean at `center`, scene units.
     pub mean: [f64; 3],
-    /// Middle of its life, and the time to which mean and rotation belong, seconds.
+    /// Middle of its lifespan, and the time to which mean and rotation belong, seconds.
     pub center: f64,
-    /// Seconds before and after the centre for which it is fully there; infinite: it lives for ever.
+    /// Seconds before and after the centre for which it is fully there; infinite: it has an infinite lifespan.
     pub half_width: f64,
-    /// Standard deviation of the Gaussian tails of its life, seconds.
+    /// Standard deviation of the Gaussian tails of its lifespan, seconds.
     pub softness: f64,
     /// Rotation wxyz at `center`; need not be normalised.
     pub quat: [f32; 4],
     /// Standard deviations along its axes, scene units.
     pub scales: [f32; 3],
-    /// Opacity in the middle of its life, 0 to 1.
+    /// Opacity in the middle of its lifespan, 0 to 1.
     pub opacity: f32,
-    /// Scene units a second.
+    /// Scene units per second.
     pub velocity: [f32; 3],
     /// Angular velocity about the world's axes, radians a second.
     pub turn: [f32; 3],
@@ -111,7 +111,7 @@ pub struct Primitive {
     pub features: Vec<f32>,
 }
 
-/// Gaussians that are drawn for from ≤ t < to.
+/// Gaussians that are rendered for from ≤ t < to.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Node {
     /// First second.
@@ -122,7 +122,7 @@ pub struct Node {
     pub primitives: Vec<Primitive>,
 }
 
-/// All that goes into a playback file.
+/// Content of a playback file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Draft {
     /// About the scene; `gaussians` is counted by the writer.

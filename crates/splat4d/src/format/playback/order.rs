@@ -1,8 +1,8 @@
-//! The order of the Gaussians of a page: blocks of 256 that are alike, so that a block is culled whole and its ranges are
-//! narrow.
+//! The order of the Gaussians of a page: blocks of 256 that are alike, so that a block is culled whole and its ranges
+//! are narrow.
 //!
-//! A k-d tree over place, life and size halves the page at whole blocks, each time across what differs most; within a
-//! block Gaussians are in Morton order, which deflate likes.
+//! A k-d tree over position, life and size halves the page at whole blocks, each time across what differs most; within
+//! a block Gaussians are in Morton order, which deflate likes.
 
 use super::page::lives_through;
 use super::{BLOCK_GAUSSIANS, Primitive};
@@ -10,12 +10,12 @@ use crate::format::quant::{MORTON_BITS, morton};
 
 /// Place 3, first and last second 2, logarithm of the size 1.
 const FEATURES: usize = 6;
-/// A spread of the whole span in time counts as much as this many standard deviations of all places: a block that is
-/// dead is not even examined, one out of sight is seldom.
+/// A spread of the whole span in time counts as much as this many standard deviations of all positions: a block that is
+/// dead is skipped, one out of sight is examined rarely.
 const TIME_WEIGHT: f64 = 4.0;
-/// A factor e in size counts as much as this many standard deviations of all places.
+/// A factor e in size counts as much as this many standard deviations of all positions.
 const SIZE_WEIGHT: f64 = 0.35;
-/// Standard deviations of its tails at which a life counts as over: o·σ is 1/255 at 3.3 of an opaque Gaussian.
+/// Standard deviations of its tails at which a lifespan counts as over: o·σ is 1/255 at 3.3 of an opaque Gaussian.
 const TAILS: f64 = 3.0;
 /// Cells along the longest side of a block's box, within which Morton order is distinguished.
 const CELLS: f64 = (1u32 << 10) as f64;

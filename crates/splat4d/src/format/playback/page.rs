@@ -19,11 +19,11 @@ pub(super) const HALF10: u32 = 511;
 pub(super) const WIDTH_LEVELS: u32 = 253;
 /// Code of a half-width that never ends.
 pub(super) const FOR_EVER: u32 = 255;
-/// Standard deviations of its tails that a life's reach holds (docs/format.md).
+/// Standard deviations of its tails that a lifespan's reach holds (docs/format.md).
 const REACH: f64 = 3.0;
-/// Logarithms of a header are within ± this (docs/format.md), so that squares of what they stand for fit an f32.
+/// Logarithms of a header are within ± this (docs/format.md), so that squares of what they represent fit an f32.
 pub(super) const MAX_LOG: f64 = 40.0;
-/// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of what is seen is never seen, and the
+/// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of a visible size is invisible, and the
 /// block's range of scales would pay for it.
 pub(super) const THINNEST: f64 = 1e-3;
 /// Places of a block header (docs/format.md, "Page").
@@ -45,11 +45,11 @@ pub(super) type Header = [f32; BLOCK_HEADER];
 /// A decoded page: headers and words as the file's bits have them.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Page {
-    /// It is drawn for from ≤ t < to, seconds.
+    /// It is rendered for from ≤ t < to, seconds.
     pub span: [f64; 2],
-    /// One a block of 256 Gaussians.
+    /// One per block of 256 Gaussians.
     pub headers: Vec<[f32; BLOCK_HEADER]>,
-    /// One a Gaussian.
+    /// One per Gaussian.
     pub words: Vec<[u32; PAGE_WORDS]>,
     /// Place of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
@@ -60,11 +60,11 @@ pub(crate) struct Page {
 pub(crate) struct Record {
     /// Mean at `center`, scene units.
     pub mean: [f64; 3],
-    /// Middle of its life, seconds.
+    /// Middle of its lifespan, seconds.
     pub center: f64,
-    /// Seconds for which it is fully there before and after; infinite: for ever.
+    /// Seconds for which it is fully there before and after; infinite: always.
     pub half_width: f64,
-    /// Standard deviation of the tails of its life, seconds.
+    /// Standard deviation of the tails of its lifespan, seconds.
     pub softness: f64,
     /// Unit rotation wxyz at `center`.
     pub quat: [f64; 4],
@@ -72,7 +72,7 @@ pub(crate) struct Record {
     pub scales: [f64; 3],
     /// 0 to 1.
     pub opacity: f64,
-    /// Scene units a second.
+    /// Scene units per second.
     pub velocity: [f64; 3],
     /// Radians a second about the world's axes.
     pub turn: [f64; 3],
@@ -88,7 +88,7 @@ pub(crate) fn decode_page(entry: &Entry, stored: &[u8]) -> Result<Page> {
     parse_page(&unpack(entry, stored)?, entry)
 }
 
-/// A page from its decoded bytes, of which there are as many as the entry's count asks for.
+/// A page from its decoded bytes, of which there are as many as the entry's count requests.
 pub(super) fn parse_page(bytes: &[u8], entry: &Entry) -> Result<Page> {
     let n = entry.count as usize;
     let (head, planes) = bytes.split_at(n.div_ceil(BLOCK_GAUSSIANS) * 4 * BLOCK_HEADER);
@@ -126,7 +126,7 @@ pub(super) fn unpack<'a>(entry: &Entry, stored: &'a [u8]) -> Result<std::borrow:
     match entry.codec {
         Codec::Raw if stored.len() == wanted => Ok(stored.into()),
         Codec::Deflate => {
-            // The entry's check has seen that so few bytes can become so many.
+            // The entry's check has seen that so few bytes can become this many.
             let mut out = vec![0; wanted];
             let mut inflate = flate2::Decompress::new(false);
             let status = inflate.decompress(stored, &mut out, flate2::FlushDecompress::Finish);
@@ -148,14 +148,14 @@ pub(super) fn page_of(headers: &[Header], words: &[[u32; PAGE_WORDS]]) -> Vec<u8
     out
 }
 
-/// Scales as they are written: positive, and none far below the largest.
+/// Scales as written: positive, and none far below the largest.
 pub(super) fn scales(p: &Primitive) -> [f64; 3] {
     let scales = p.scales.map(f64::from);
     let largest = scales[0].max(scales[1]).max(scales[2]);
     scales.map(|s| s.max(THINNEST * largest).max((-MAX_LOG).exp()))
 }
 
-/// Whether a Gaussian is fully there during all of its node, and so may be written as living for ever.
+/// Whether a Gaussian is fully there during all of its node, and so may be written as with infinite lifespans.
 #[inline(always)]
 pub(super) fn lives_through(center: f64, half_width: f64, span: [f64; 2]) -> bool {
     center - half_width <= span[0] && span[1] <= center + half_width

@@ -1,5 +1,5 @@
-//! A playback file taken apart into layers that can be changed, and put together again: the same pages, rows in the same
-//! order, labels and palette as they are.
+//! A playback file taken apart into layers that can be changed, and put together again: the same pages, rows in the
+//! same order, labels and palette unchanged.
 
 use super::block::turn_over;
 use super::coder::{Encode, Rows};
@@ -22,7 +22,7 @@ use std::io::Write;
 pub struct Pages {
     /// About the scene.
     pub meta: Meta,
-    /// One a page, in the file's order, rows as in the file; they hold the palette's coefficients.
+    /// One per page, in the file's order, rows as in the file; they hold the palette's coefficients.
     pub layers: Vec<Layer<f32>>,
     /// Of every page its Gaussians' entries of the palette.
     pub labels: Vec<Vec<u16>>,
@@ -50,8 +50,8 @@ impl Pages {
 pub struct PagesDraft<'a> {
     /// About the scene; `gaussians` is counted by the writer.
     pub meta: &'a Meta,
-    /// One a page with its span and, where it has some, its masks, in the order of the file. A layer without rows is left
-    /// out.
+    /// One per page with its span and, where it has some, its masks, in the order of the file. A layer without rows is
+    /// left out.
     pub layers: &'a [Layer<f32>],
     /// Of every layer its rows' entries of the palette.
     pub labels: &'a [Vec<u16>],
@@ -86,11 +86,11 @@ pub fn read_pages(bytes: &[u8]) -> Result<Pages> {
 }
 
 /// Writes pages in the order in which they are given; of `config` only depths and the effort of deflate count. What
-/// [`read`](super::read()) gives back is what [`Coder::show`](super::Coder::show) shows of these layers, bit for bit. The
-/// errors in the summary are not measured.
+/// [`read`](super::read()) gives back is what [`Coder::show`](super::Coder::show) shows of these layers, bit for bit.
+/// The errors in the summary are not measured.
 ///
-/// Errors: numbers that are not finite, labels beyond the palette, spans, depths or metadata out of range, a page with too
-/// many rows, the sink's. Panics: lists of different lengths, a layer that is none that a page gives.
+/// Errors: numbers that are not finite, labels beyond the palette, spans, depths or metadata out of range, a page with
+/// too many rows, the sink's. Panics: lists of different lengths, a layer that is none that a page gives.
 pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
     let n = draft.layers.len();
     assert!(draft.tiers.len() == n, "{} tiers of {n} layers", draft.tiers.len());
@@ -105,7 +105,7 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
     let start = meta.clip[0];
     let mut file = Sections::new(meta, draft.poster, config.deflate_level)?;
     let pages: Vec<usize> = (0..n).filter(|&i| !draft.layers[i].params.is_empty()).collect();
-    // As `write` has it: before the palette come the important Gaussians of the clip's start, in their base colours.
+    // As in `write`: before the palette come the important Gaussians of the clip's start, in their base colours.
     let first =
         |i: &&usize| draft.tiers[**i] == 0 && draft.layers[**i].span[0] <= start && start < draft.layers[**i].span[1];
     let before = pages.iter().take_while(first).count();

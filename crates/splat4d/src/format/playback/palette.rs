@@ -6,7 +6,7 @@ use super::{Entry, Kind};
 use crate::Result;
 use crate::math::sh;
 
-/// A code stands for (code − 128)/127 of its range.
+/// A code represents (code − 128)/127 of its range.
 const MIDDLE: i32 = 128;
 const HALF: f32 = 127.0;
 
@@ -52,8 +52,8 @@ fn degree_of_plane(plane: usize) -> usize {
 }
 
 impl Palette {
-    /// Quantises entries of `width` = 3(K − 1) coefficients each, entry after entry; within one, coefficient k = 1 … K − 1
-    /// of channel c is number 3(k − 1) + c. Panics: no entry, or a width that no degree has.
+    /// Quantises entries of `width` = 3(K − 1) coefficients each, entry after entry; within one, coefficient k = 1 … K
+    /// − 1 of channel c is number 3(k − 1) + c. Panics: no entry, or a width that no degree has.
     pub fn new(degree: usize, values: &[f32]) -> Self {
         let width = 3 * (sh::coeffs(degree) - 1);
         let entries = values.len() / width;
@@ -85,7 +85,7 @@ impl Palette {
         self.ranges[degree_of_plane(plane) - 1] * SHARES[usize::from(self.codes[plane * self.entries + entry])]
     }
 
-    /// Coefficient `plane` of entries in turn. Panics: there is no such entry or plane.
+    /// Coefficient `plane` of consecutive entries. Panics: there is no such entry or plane.
     pub(super) fn values(&self, plane: usize, entries: &[u16], mut each: impl FnMut(usize, f32)) {
         let codes = &self.codes[plane * self.entries..(plane + 1) * self.entries];
         let range = self.ranges[degree_of_plane(plane) - 1];

@@ -1,4 +1,4 @@
-//! Where a file comes from: an optional section of JSON, which readers that do not know it skip.
+//! Provenance of a file: an optional section of JSON, which readers without support skip.
 
 use super::index::{broken, crc};
 use super::write::GENERATOR;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// Most bytes of the section (docs/format.md, "Provenance").
 const MOST_BYTES: usize = 1 << 20;
 
-/// Where a file comes from. What is not known is left out.
+/// Provenance of a file. Unknown fields are left out.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Provenance {
@@ -21,7 +21,7 @@ pub struct Provenance {
     /// Hash of the capture's names, poses and times, 16 hexadecimal digits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub capture: Option<String>,
-    /// Edits that were made, in order, as docs/edit.md has them.
+    /// Edits that were made, in order, as in docs/edit.md.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<serde_json::Value>,
     /// The maker's own words: whom it shows, who may use it.
@@ -41,9 +41,9 @@ pub fn provenance(bytes: &[u8]) -> Result<Option<Provenance>> {
         return Err(broken("the checksum of its provenance is wrong".into()));
     }
     if entry.codec != Codec::Raw {
-        return Err(broken("its provenance is stored in a way that is not known".into()));
+        return Err(broken("its provenance has an unknown encoding".into()));
     }
-    let wrong = |e| broken(format!("its provenance is not what it must be: {e}"));
+    let wrong = |e| broken(format!("its provenance is invalid: {e}"));
     serde_json::from_slice(stored).map(Some).map_err(wrong)
 }
 
@@ -56,7 +56,7 @@ pub fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>
         return Err(broken("it is cut short".into()));
     }
     let mut parts: Vec<Vec<u8>> = Vec::with_capacity(index.sections.len() + 1);
-    // Sections are named by their places, which move up behind one that goes.
+    // Sections are named by their positions, which move up after a removed one.
     let places: Vec<u32> = index
         .sections
         .iter()

@@ -4,7 +4,7 @@
 // No bindings and no entry point: plain functions, put in front of whatever shader calls them, here and in the player.
 // A thread owns one Gaussian.
 
-// Header of a block as 32 numbers, 128 bytes: the file's 24, then what the page says once for all of its blocks.
+// Header of a block as 32 numbers, 128 bytes: the file's 24, then what the page states once for all of its blocks.
 struct BlockHeader {
     f: array<vec4<f32>, 6>, // header numbers 0-3, 4-7, ... of docs/format.md
     span: f32,              // to - from of the page, s
@@ -15,7 +15,7 @@ struct BlockHeader {
     entries: u32,           // entries of the palette, at least 1
 }
 
-// What the words say about time.
+// What the words contain about time.
 struct Life {
     delta: f32,    // t - c, s
     reach: f32,    // R, s: what shift and turn are measured over
@@ -36,7 +36,7 @@ struct Gaussian {
 const CODE_8: f32 = 255.0;
 const CODE_16: f32 = 65535.0;
 const CODE_10_MIDDLE: f32 = 511.0;
-// Half-width codes: 0 is zero, 255 lives for ever, between them 253 steps.
+// Half-width codes: 0 is zero, 255 has an infinite lifespan, between them 253 steps.
 const FOREVER: u32 = 255u;
 const HALF_WIDTH_STEPS: f32 = 253.0;
 // A dying Gaussian's reach has this many softnesses on either side.
@@ -86,7 +86,7 @@ fn life_at(words: array<u32, 8>, header: array<vec4<f32>, 6>, span: f32, t: f32)
     return out;
 }
 
-// o * sigma alone: whoever culls by it need not unpack the rest.
+// o * sigma alone: culling by it needs nothing else unpacked.
 fn opacity_at(words: array<u32, 8>, life: Life) -> f32 {
     return f32(words[2] >> 24u) / CODE_8 * life.envelope;
 }

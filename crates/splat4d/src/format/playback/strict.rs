@@ -1,4 +1,4 @@
-//! What docs/format.md asks of writers and readers need not check: [`strict`] lists how a file deviates from it.
+//! Requirements of docs/format.md on writers that readers need not check: [`strict`] lists how a file deviates from it.
 
 use super::index::{broken, raw_entry};
 use super::page::{Header, at, seen_widths};
@@ -7,7 +7,7 @@ use crate::Result;
 
 /// Bits of words that no field has, by word.
 const SPARE: [(usize, u32); 3] = [(4, 3 << 30), (5, 3 << 30), (7, 0xFF << 24)];
-/// Ranges of a block header: name, place of the least number, distance to the greatest.
+/// Ranges of a block header: name, position of the least number, distance to the greatest.
 const RANGES: [(&str, usize, usize); 11] = [
     ("x", at::BOX, 3),
     ("y", at::BOX + 1, 3),
@@ -53,7 +53,7 @@ fn of_header(bytes: &[u8], index: &Index, out: &mut Vec<String>) {
     }
     let least = index.least_version();
     if !grows && minor > VERSION[1] {
-        out.push(format!("the minor version is {minor}, this splat4d knows {}", VERSION[1]));
+        out.push(format!("the minor version is {minor}, this splat4d supports {}", VERSION[1]));
     } else if !grows && minor > least[1] {
         let [a, b] = least;
         out.push(format!("the version is {major}.{minor}, and nothing in the file needs more than {a}.{b}"));

@@ -20,7 +20,7 @@ use crate::scene::{Camera, Time};
 /// A file that version 1.0 of the writer made from [`tiny`], byte for byte.
 const GOLDEN: &[u8] = include_bytes!("../../../tests/data/tiny.s4d");
 
-/// A Gaussian of a synthetic scene. One in three lives for ever.
+/// A Gaussian of a synthetic scene. One in three has an infinite lifespan.
 fn primitive(r: Rng) -> Primitive {
     let three = |first: u64, by: f64| std::array::from_fn(|k| (by * r.normal(first + k as u64)) as f32);
     let width = if r.below(0, 3) == 0 { f64::INFINITY } else { (r.uniform(1) - 0.5).max(0.0) };
@@ -67,7 +67,8 @@ fn made_up(n: usize, sh_degree: usize, seed: u64) -> Draft {
     Draft { meta, nodes: nodes.collect(), poster: Some(b"not really a picture".to_vec()) }
 }
 
-/// A draft that the golden file was made of: simple numbers, two nodes, degree 1, one Gaussian that moves, one that turns.
+/// A draft that the golden file was made of: simple numbers, two nodes, degree 1, one Gaussian that moves, one that
+/// turns.
 fn tiny() -> Draft {
     let still = Primitive {
         mean: [0.0, 0.5, 2.0],
@@ -415,7 +416,7 @@ fn golden_file_is_written_only_on_request() {
 }
 
 #[test]
-fn what_cannot_be_written_is_named() {
+fn unsupported_content_is_named_when_writing() {
     let refused = |change: fn(&mut Draft)| {
         let mut draft = made_up(40, 1, 9);
         change(&mut draft);
@@ -426,7 +427,7 @@ fn what_cannot_be_written_is_named() {
     assert!(refused(|d| d.nodes[2].to = 0.1).contains("node 2"));
     assert!(refused(|d| d.meta.clip = [1.0, 0.0]).contains("clip"));
     assert!(refused(|d| d.meta.sh_degree = 4).contains("sh_degree"));
-    // Nothing at all is a file without pages, and odd Gaussians are drawn as well as they can be.
+    // Nothing at all is a file without pages, and odd Gaussians are rendered as well as they can be.
     let mut empty = made_up(4, 1, 9);
     empty.nodes.clear();
     assert_eq!(read(&bytes_of(&empty, &WriteConfig::default()).0).unwrap().len(), 0);

@@ -26,7 +26,7 @@ const SMALLEST_TIER: usize = 4096;
 pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
 const RANGE_BYTES: usize = 12;
-/// A poster up to this size comes before everything else; a larger one would only delay the first image.
+/// A poster up to this size is placed before everything else; a larger one would only delay the first image.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
 const WEIGHTS: [f32; 2] = [0.01, 100.0];
@@ -68,7 +68,7 @@ impl ErrorStat {
     fn add(&mut self, difference: f64) {
         let d = difference.abs();
         self.max = self.max.max(d);
-        // Until `finish` the sum of squares stands in `rms`.
+        // Until `finish` the sum of squares is in `rms`.
         self.rms += d * d;
         self.count += 1.0;
     }
@@ -81,17 +81,17 @@ impl ErrorStat {
 /// Errors of quantisation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
-    /// Means in the middle of lives, per axis, scene units.
+    /// Means in the middle of lifespans, per axis, scene units.
     pub mean: ErrorStat,
     /// Scales, difference of logarithms; those below 1/1000 of the Gaussian's largest are taken for 1/1000, as written.
     pub scale: ErrorStat,
-    /// Rotations in the middle of lives, radians.
+    /// Rotations in the middle of lifespans, radians.
     pub rotation: ErrorStat,
-    /// Opacity in the middle of lives.
+    /// Opacity in the middle of lifespans.
     pub opacity: ErrorStat,
-    /// Half-widths and softness of lives, seconds.
+    /// Half-widths and softness of lifespans, seconds.
     pub life: ErrorStat,
-    /// Velocities, scene units a second and axis.
+    /// Velocities, scene units per second and axis.
     pub velocity: ErrorStat,
     /// Angular velocities, radians a second and axis.
     pub turn: ErrorStat,
@@ -136,7 +136,7 @@ pub(super) struct Sections {
     pub file: Index,
     bodies: Vec<Vec<u8>>,
     level: u32,
-    /// Labels and features by the section of their page: written behind everything that is drawn.
+    /// Labels and features by the section of their page: written behind everything that is rendered.
     labels: Vec<(u32, Vec<u8>)>,
     features: Vec<(u32, Vec<u8>)>,
     /// A poster that is written last.
@@ -192,7 +192,7 @@ impl Sections {
         Ok(())
     }
 
-    /// Labels of the page that was added last, one a Gaussian.
+    /// Labels of the page that was added last, one per Gaussian.
     pub(super) fn labels(&mut self, of: impl Iterator<Item = Option<u8>>) {
         let page = self.last_page();
         self.labels.extend(labels::bytes(of).map(|bytes| (page, bytes)));
@@ -263,8 +263,8 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         .enumerate()
         .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, entries) = palette(draft, config);
-    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what
-    // colours them, the rest of them; then time goes on.
+    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what colours
+    // them, the rest of them; then time continues.
     let start = draft.meta.clip[0];
     let mut pieces = pieces(draft, config);
     let holds = |p: &Piece| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;
@@ -273,7 +273,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         let (first_a, first_b) = (holds(a), holds(b));
         let by_time = na.from.total_cmp(&nb.from).then(nb.to.total_cmp(&na.to)).then(a.node.cmp(&b.node));
         let by_tier = a.tier.cmp(&b.tier);
-        // At the start all nodes are wanted at once, and a tier goes before a node; later it is the other way round.
+        // At the start all nodes are needed at once, and a tier goes before a node; later it is the other way round.
         first_b.cmp(&first_a).then(if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) })
     });
     let before = pieces.iter().take_while(|p| p.tier == 0 && holds(p)).count();
@@ -312,7 +312,7 @@ fn entry(kind: Kind) -> Entry {
     Entry::plain(kind, &[])
 }
 
-/// How many bytes come before a section's byte planes, and how many a plane has.
+/// Bytes before a section's byte planes, and bytes per plane.
 fn runs(entry: &Entry) -> (usize, usize) {
     let count = entry.count as usize;
     match entry.kind {

@@ -15,7 +15,7 @@ pub(super) enum Thickness {
     Sphere,
 }
 
-/// Properties of Gaussians, by their places in the element.
+/// Properties of Gaussians, by their positions in the element.
 pub(super) struct Columns {
     /// One for each column of the geometry; those of scales that are not there repeat the first.
     pub(super) geometry: Vec<usize>,
@@ -30,15 +30,15 @@ pub(super) struct Columns {
 
 /// The 3D filter of Mip-Splatting, and of Gaussian Opacity Fields, which took it over.
 const FILTER: &str = "filter_3D";
-/// Properties that change what a Gaussian looks like, and which method writes them. Sources: the methods' `save_ply`.
+/// Properties that change the appearance of a Gaussian, and which method writes them. Sources: the methods' `save_ply`.
 const KERNELS: [(&str, &str); 2] =
     [("beta", "Deformable Beta Splatting"), ("shape", "Generalized Exponential Splatting")];
 /// How properties begin from which a network makes the Gaussians, and which methods write them.
 const NETWORKS: [(&str, &str); 2] =
     [("f_anchor_feat", "anchors of Scaffold-GS or a method built on it"), ("f_offset", "anchors of Scaffold-GS")];
 
-/// The properties of Gaussians. Errors: some are missing (the message names what the file holds in their place); spherical
-/// harmonics above degree 3.
+/// The properties of Gaussians. Errors: some are missing (the message names what the file holds in their place);
+/// spherical harmonics above degree 3.
 pub(super) fn of(vertex: &Element) -> Result<Columns> {
     let all = |names: [&str; 3]| names.iter().all(|n| vertex.find(n).is_some());
     let rgb = [RGB_NAMES, SHORT_RGB_NAMES].into_iter().find(|names| !all(DC_NAMES) && all(*names));
@@ -63,7 +63,7 @@ pub(super) fn of(vertex: &Element) -> Result<Columns> {
     Ok(Columns { geometry: columns, sh, rgb: rgb.is_some(), thickness, filter: vertex.find(FILTER) })
 }
 
-/// What was assumed of the columns, and what `extra` properties change though they are not read.
+/// Assumptions about the columns, and effects of `extra` properties that are not read.
 pub(super) fn assumptions(rgb: bool, thickness: Thickness, filtered: bool, extra: &[String]) -> Vec<String> {
     let mut out = Vec::new();
     let mut say = |when: bool, what: &str| out.extend(when.then(|| what.to_owned()));
@@ -85,7 +85,7 @@ fn lacking(vertex: &Element, missing: &[&str], rgb: bool) -> Error {
     if let Some((_, what)) = NETWORKS.iter().find(|(begin, _)| names().any(|n| n.starts_with(begin))) {
         let what = format!("this file holds {what}: a network makes the Gaussians of them for each view");
         return Error::new(ErrorKind::Unsupported, what).remedy(
-            "Such a scene cannot be drawn without its network. Export the Gaussians of one view, or train with 3DGS",
+            "Such a scene cannot be rendered without its network. Export the Gaussians of one view, or train with 3DGS",
         );
     }
     let is_position = |n: &&str| ["x", "y", "z"].contains(n);
@@ -96,7 +96,7 @@ fn lacking(vertex: &Element, missing: &[&str], rgb: bool) -> Error {
             "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
             names.join(", ")
         ))
-        .remedy("A point cloud can start a training, but it cannot be drawn; give a trained .ply");
+        .remedy("A point cloud can start a training, but it cannot be rendered; give a trained .ply");
     }
     Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", ")))
         .remedy("A file of 3D Gaussians has x y z, f_dc_0..2 (or red green blue), opacity, scale_0..2 and rot_0..3")

@@ -128,7 +128,7 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     std::array::from_fn(|i| if i == largest { rest } else { others.next().expect("three of four are small") })
 }
 
-/// The writer floors, so that a byte stands for the middle of its interval; the ends stand for themselves.
+/// The writer floors, so that a byte represents the middle of its interval; the ends represent themselves.
 fn unpack_sh(table: &mut Table, f_rest: &[usize], sh: &rows::Rows<'_>) {
     for row in 0..sh.len() {
         for (k, &property) in f_rest.iter().enumerate() {

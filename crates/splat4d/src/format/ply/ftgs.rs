@@ -1,8 +1,9 @@
 //! `.ftgs.ply` of FreeTimeGsVanilla, version 1: 3DGS with a time, a duration and a velocity each
 //! ([`freetime`](crate::format::freetime)).
 //!
-//! To the properties of a plain file come time, log_duration (clips) and velocity_0..2 (units per clip), all f32; comments
-//! state `ftgs_version`, `n_frames`, `use_velocity`. Our files say clip and frame rate in a further comment.
+//! To the properties of a plain file come time, log_duration (clips) and velocity_0..2 (units per clip), all f32;
+//! comments state `ftgs_version`, `n_frames`, `use_velocity`. Our files specify clip and frame rate in a further
+//! comment.
 //! Source: OpsiClear-4DGS/FreeTimeGsVanilla, README and player.
 
 use super::header::{Element, Header};
@@ -33,7 +34,7 @@ pub(crate) const FTGS: Dialect = Dialect {
 
 /// Properties in addition to those of a plain file.
 const EXTRA: [&str; 5] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
-/// Curvature (units) and rotation (radians) over a life from which it counts as lost.
+/// Curvature (units) and rotation (radians) over a lifespan from which it counts as lost.
 const VISIBLE: f64 = 1e-4;
 /// Least opacity that players of the format render.
 const FLOOR: &str = "opacity_floor 0.0001";
@@ -66,7 +67,7 @@ fn read_ftgs(bytes: &[u8]) -> Result<Opened> {
         },
     };
     let mut warnings = Warnings::default();
-    info.assumed.into_iter().for_each(|sentence| warnings.say(sentence));
+    info.assumed.into_iter().for_each(|sentence| warnings.add(sentence));
     let own = header.comments.iter().find_map(|c| clock(c));
     let seconds = match own {
         Some(own) => span(own.clip),
@@ -87,7 +88,7 @@ fn span(clip: [f64; 2]) -> f64 {
     if clip[1] > clip[0] { clip[1] - clip[0] } else { 1.0 }
 }
 
-/// Writes a moving scene. Errors: it moves in a way that the format cannot say and may not be fitted; the sink's.
+/// Writes a moving scene. Errors: the format cannot express its motion, and fitting is not allowed; the sink's.
 fn write_ftgs(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let fps = if scene.fps > 0.0 { scene.fps } else { DEFAULT_FPS };
@@ -112,7 +113,7 @@ fn write_ftgs(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) 
     }
     warnings.counted(curved, rows.len(), "have curved paths: the tangents at the middle of their lifespans are stored");
     warnings.counted(turning, rows.len(), "rotate: the rotation at the middle of their lifespans is stored");
-    warnings.counted(brief, rows.len(), "live for less than 0.02 of the clip, the shortest that players support");
+    warnings.counted(brief, rows.len(), "have lifespans below 0.02 of the clip, the shortest that players support");
     let absorbed: Vec<_> = scene.layers.iter().map(|layer| layer.with_frame_absorbed()).collect();
     let width = scene.layers.iter().map(|l| l.params[SH].width()).max().unwrap_or(3);
     let rest = F_REST_COUNTS.into_iter().find(|n| n + 3 >= width).unwrap_or(0);
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn straight_paths_come_back_exactly() {
+    fn straight_paths_round_trip_exactly() {
         for life in [LifeKind::GaussHalf, LifeKind::GaussOne] {
             let mut scene = moving(200, life, 1, false);
             let sh = crate::format::samples::gaussians(200, 9)[SH].clone();
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_format_lacks_is_fitted_or_refused() {
+    fn unsupported_features_are_fitted_or_refused() {
         let scene = moving(50, LifeKind::GaussHalf, 3, true);
         let said = written(&scene, true).unwrap_err().to_string();
         assert!(said.contains("paths curve") && said.contains("rotate"), "{said}");

@@ -9,7 +9,7 @@ use std::borrow::Cow;
 const MAX_HEADER: usize = 1 << 20;
 /// UTF-8's byte-order mark, with which editors begin text files.
 const BOM: &[u8] = b"\xef\xbb\xbf";
-/// Lines that say nothing about the body.
+/// Lines that carry no information about the body.
 const COMMENTS: [&str; 2] = ["comment", "obj_info"];
 
 /// Whether bytes begin as a PLY file does.
@@ -92,7 +92,7 @@ impl Element {
         self.properties.iter().position(|p| p.name == name && matches!(p.kind, Kind::Scalar(_)))
     }
 
-    /// The number that stands for full colour in a property: 1 in floating point (no other range is written), the
+    /// The number that represents full colour in a property: 1 in floating point (no other range is written), the
     /// type's range in integers.
     pub(super) fn white(&self, property: usize) -> f64 {
         match self.properties[property].kind {
@@ -109,7 +109,7 @@ pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) comments: Vec<String>,
     pub(super) elements: Vec<Element>,
-    /// Where the body begins.
+    /// Offset of the body.
     pub(super) body: usize,
 }
 
@@ -148,7 +148,7 @@ impl Header {
                 Some("element") => header.elements.push(element(line, words).map_err(at)?),
                 Some("property") => {
                     let Some(element) = header.elements.last_mut() else {
-                        return Err(at(broken("a property stands before the first element")));
+                        return Err(at(broken("a property precedes the first element")));
                     };
                     element.properties.push(property(line, words).map_err(at)?);
                 }
@@ -172,7 +172,7 @@ impl Header {
     }
 }
 
-/// A name that stands twice. By sorting, since a false header may hold a hundred thousand.
+/// A name that occurs twice. By sorting, since a false header may hold a hundred thousand.
 fn repeated<'a>(names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let mut names: Vec<&str> = names.collect();
     names.sort_unstable();

@@ -77,10 +77,10 @@ const _: () = assert!(GEOMETRY_COLUMNS.len() == 4, "GEOMETRY_NAMES names these c
 pub struct PlyPoints {
     /// Positions, in the file's units.
     pub positions: Vec<[f64; 3]>,
-    /// Red, green, blue of each point, from 0 to 1 in files that keep to their format (in sRGB, as cameras give it); empty
-    /// where the file has no colours.
+    /// Red, green, blue of each point, from 0 to 1 in files that keep to their format (in sRGB, as cameras give it);
+    /// empty where the file has no colours.
     pub colors: Vec<[f32; 3]>,
-    /// Seconds at which each point was seen (`time` or `t`); empty where the file does not say it.
+    /// Seconds at which each point was seen (`time` or `t`); empty where the file does not state them.
     pub times: Vec<f64>,
 }
 
@@ -144,9 +144,9 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
 fn open(bytes: &[u8]) -> Result<Opened> {
     let (params, info) = read(bytes)?;
     let mut warnings = Warnings::default();
-    info.assumed.iter().for_each(|sentence| warnings.say(sentence));
+    info.assumed.iter().for_each(|sentence| warnings.add(sentence));
     for (what, evidence) in linear::doubts(&params) {
-        warnings.say(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
+        warnings.add(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
     }
     let offset = info.offset;
     let mut opened = Opened { ply: Some(info), ..Opened::from((params, warnings)) };
@@ -154,8 +154,8 @@ fn open(bytes: &[u8]) -> Result<Opened> {
     Ok(opened)
 }
 
-/// What follows the rows of the last element, if it is not only space: rows that the header does not count, or bytes that a
-/// copy in text mode added. `rows` are those of the last element.
+/// Data after the rows of the last element, if it is not only space: rows that the header does not count, or bytes that
+/// a copy in text mode added. `rows` are those of the last element.
 fn surplus(header: &Header, rows: &Rows<'_>) -> Option<String> {
     let element = header.elements.last().filter(|e| e.name == "vertex" || e.name == "sh")?;
     let after = rows.after();
@@ -176,8 +176,8 @@ pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
     Header::read(bytes).is_ok_and(|h| h.elements.iter().any(packed))
 }
 
-/// Reads the positions of any PLY file, the times of its points, and their colours: `red green blue`, `r g b`, or the base
-/// colour of Gaussians.
+/// Reads the positions of any PLY file, the times of its points, and their colours: `red green blue`, `r g b`, or the
+/// base colour of Gaussians.
 ///
 /// Errors: not a PLY file, truncated, or without positions.
 pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
@@ -211,12 +211,14 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
 
 /// Writes Gaussians in the plain layout, little-endian; normals are zero and other tables are left out.
 ///
-/// Errors: a number is NaN or infinite; the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree 0-3).
+/// Errors: a number is NaN or infinite; the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree
+/// 0-3).
 pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
     write_placed(params, ([0.0; 3], false), out)
 }
 
-/// The same of a scene with an offset: added in double precision where `world`, else a comment from which it is read back.
+/// The same of a scene with an offset: added in double precision where `world`, else a comment from which it is read
+/// back.
 pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mut impl Write) -> Result<()> {
     params.check_finite()?;
     let world = world && offset != [0.0; 3];

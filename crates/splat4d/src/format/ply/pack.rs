@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn every_degree_comes_back_within_its_steps() {
+    fn every_degree_round_trips_within_its_steps() {
         for coefficients in [1, 4, 9, 16] {
             for rows in [0, 1, 256, 1000] {
                 let p = gaussians(rows, coefficients);

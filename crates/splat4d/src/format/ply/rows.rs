@@ -3,7 +3,7 @@
 use super::header::{Element, Encoding, Header, Kind, Scalar, broken};
 use crate::Result;
 
-/// The rows of an element; every row is known to be there.
+/// The rows of an element; every row is known to exist.
 pub(super) struct Rows<'a> {
     count: usize,
     body: Body<'a>,
@@ -32,7 +32,7 @@ impl<'a> Rows<'a> {
     /// The numbers of property `property` in rows `first..`, rounded to f32.
     #[inline]
     pub(super) fn read(&self, property: usize, first: usize, out: &mut [f32]) {
-        assert!(first + out.len() <= self.count, "rows past the end of an element were asked for");
+        assert!(first + out.len() <= self.count, "rows past the end of an element were requested");
         match &self.body {
             Body::Binary { bytes, stride, big, fields } => {
                 let (scalar, offset) = fields[property];
@@ -64,7 +64,7 @@ impl<'a> Rows<'a> {
 }
 
 /// Walks through the body and returns the rows of the `wanted` elements (in that order; `None` where the file has no
-/// such element). Stops after the last wanted one: what follows is ignored.
+/// such element). Stops after the last requested one: what follows is ignored.
 pub(super) fn find<'a, const N: usize>(
     header: &Header,
     bytes: &'a [u8],

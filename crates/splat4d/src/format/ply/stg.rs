@@ -1,9 +1,9 @@
 //! The `.ply` of Spacetime Gaussians (STG, "lite"): moving Gaussians, all f32.
 //!
 //! x y z, trbf_center, trbf_scale (log of s), nx ny nz, motion_0..8 (units per clip, clip², clip³), f_dc_0..2 (**plain
-//! RGB**, not SH coefficients), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz), omega_0..3. The fade is
-//! exp(−((t − centre)/s)²), no ½; t runs from 0 to 1, and 1 is one frame behind the last. The full model's f_t_* feed
-//! a network that is not in the file. Our files say clip and frame rate in a comment.
+//! RGB**, not SH coefficients), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz), omega_0..3. The fade is exp(−((t −
+//! centre)/s)²), no ½; t runs from 0 to 1, and 1 is one frame behind the last. The full model's f_t_* feed a network
+//! that is not in the file. Our files specify clip and frame rate in a comment.
 //! Source: oppo-us-research/SpacetimeGaussians (MIT), splaTV's importer.
 
 use super::header::{Element, Header, broken};
@@ -31,7 +31,7 @@ pub const STG: Dialect = Dialect {
 
 /// Numbers of a row as [`names`] lists them.
 const WIDTH: usize = 32;
-/// Where groups begin in a row.
+/// Offsets of groups in a row.
 const TRBF: usize = 3;
 const MOTION: usize = 8;
 const COLOR: usize = 17;
@@ -85,7 +85,7 @@ pub(crate) fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
             .remedy("Export the file again with the program that trained it."));
     }
     if vertex.properties.iter().any(|p| p.name.starts_with("f_t_")) {
-        warnings.say("the colours come from STG's full model, whose network is not in the file: only its base is read");
+        warnings.add("the colours come from STG's full model, whose network is not in the file: only its base is read");
     }
     let [rows] = rows::find(&header, bytes, ["vertex"])?;
     let rows = rows.expect("the element was found above");
@@ -128,7 +128,8 @@ fn unpack(x: &[f64; WIDTH]) -> Moving {
     }
 }
 
-/// Writes a moving scene. Errors: it moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+/// Writes a moving scene. Errors: the format cannot express its motion or lifespans, and fitting is not allowed; the
+/// sink's.
 pub fn write_stg(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
@@ -170,7 +171,7 @@ mod tests {
     use crate::scene::{LifeKind, Time};
 
     #[test]
-    fn a_moving_scene_comes_back_in_f32() {
+    fn a_dynamic_scene_round_trips_in_f32() {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(300, life, 3, true);
             let mut file = Vec::new();
@@ -184,7 +185,7 @@ mod tests {
         }
     }
 
-    /// A text file as the paper's code names things, without normals.
+    /// A text file with the names of the paper's code, without normals.
     #[test]
     fn a_foreign_file_is_read() {
         let names = names();

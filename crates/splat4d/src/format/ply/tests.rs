@@ -66,7 +66,7 @@ fn the_written_layout_is_the_plain_one() {
     let header = std::str::from_utf8(&bytes[..end]).unwrap();
     let names: Vec<&str> = header.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
     let row: Vec<f32> = bytes[end..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
-    // 62 numbers a row at degree 3, as every viewer expects.
+    // 62 numbers per row at degree 3, as every viewer expects.
     assert_eq!((names.len(), row.len()), (62, 62));
     let value = |name: &str| row[names.iter().position(|n| *n == name).unwrap()];
     assert_eq!(names[..7], ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]);
@@ -157,7 +157,7 @@ fn rgb_colours_are_base_colours() {
         let info = opened.ply.unwrap();
         assert!(info.rgb && info.extra_properties.is_empty() && opened.warnings.lines()[0].contains("RGB"));
     }
-    // Coefficients go first, and a cloud of points stays one.
+    // Coefficients have priority, and a point cloud stays one.
     let colors = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "red", "green", "blue"].map(|n| ("float", n));
     let both = [&colors[..], &SHAPE];
     let (p, info) = read(&text(&both.concat(), &["1 2 3 0.1 0.2 0.3 9 9 9 0.5 -4 -5 -6 1 0 0 0"])).unwrap();
@@ -237,7 +237,7 @@ fn rows_that_the_header_does_not_count_are_reported() {
 }
 
 #[test]
-fn infinities_that_mean_something_are_no_damage() {
+fn meaningful_infinities_are_accepted() {
     // No writer of ours writes infinities: they take the place of numbers that occur once.
     let marks =
         [(1, OPACITY, 1234.5, f32::INFINITY), (2, LOG_SCALE, 2345.5, f32::NEG_INFINITY), (3, 0, 3456.5, f32::INFINITY)];
@@ -253,7 +253,7 @@ fn infinities_that_mean_something_are_no_damage() {
     assert!(back[GEOMETRY].get(1, OPACITY) > 10.0 && back[GEOMETRY].get(2, LOG_SCALE) < -10.0);
     let said = DIALECT.open(&bytes).unwrap().warnings;
     assert!(said.lines()[0].contains("1 of 4 Gaussians have opacity +infinity"), "{said:?}");
-    // Nothing that can be drawn: no file.
+    // Nothing that can be rendered: no file.
     let mut lost = gaussians(2, 1);
     (0..2).for_each(|row| lost[GEOMETRY].set(row, 0, f32::NAN));
     let (scene, mut out) = (crate::format::dialect::still(lost), Vec::new());
@@ -288,7 +288,7 @@ fn positions_of_a_map_keep_their_digits() {
     let apart = apart.map(|(row, k)| (place(&far.scene, row)[k] - place(&scene, row)[k]).abs()).fold(0.0, f64::max);
     assert!(apart < 1e-6 && far.scene.offset != [0.0; 3], "{apart}");
     assert!(far.warnings.lines().is_empty(), "{:?}", far.warnings);
-    // Other formats have no room for such numbers.
+    // Other formats cannot store such numbers.
     let options = WriteOptions { world: true, ..WriteOptions::default() };
     let refused = crate::format::splat::DIALECT.write(&scene, &options, &mut Vec::new()).unwrap_err();
     assert!(refused.to_string().contains("double precision"), "{refused}");
@@ -319,7 +319,7 @@ fn inconsistent_headers_are_errors_with_a_reason() {
         (counted("18446744073709551616"), "not a number of rows"),
         (counted("-1"), "not a number of rows"),
         (counted("1e3"), "not a number of rows"),
-        (headed(&[little, "property float x"]), "before the first element"),
+        (headed(&[little, "property float x"]), "precedes the first element"),
         (headed(&[little, "element vertex 1", "property float x", "property float x"]), "two properties called `x`"),
         (headed(&[little, "element vertex 1", "element vertex 1"]), "two elements called `vertex`"),
         (headed(&[little, "element vertex 1", "property quad x"]), "`quad`"),

@@ -111,7 +111,7 @@ fn mutants_are_read_or_refused() {
     assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
 }
 
-/// One bit anywhere: the file is refused, or states what it said.
+/// One changed bit anywhere: the file is refused, or its content is unchanged.
 #[test]
 fn a_flipped_bit_is_found_by_the_checksums() {
     let whole = sample();
@@ -122,7 +122,7 @@ fn a_flipped_bit_is_found_by_the_checksums() {
         let mut flipped = whole.clone();
         flipped[at] ^= 1 << (at % 8);
         match SafeTensors::read(&flipped) {
-            // In the name under which the checksums stand: then there are none.
+            // In the key of the checksums: then there are none.
             Ok(same) if same.metadata().len() > read.metadata().len() => {
                 assert!(same.tensors().eq(read.tensors()), "byte {at}");
             }

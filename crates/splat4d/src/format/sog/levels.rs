@@ -1,7 +1,8 @@
-//! Streamed SOG (PlayCanvas), version 1: `lod-meta.json` and a folder of SOG files for each piece of each level of detail.
+//! Streamed SOG (PlayCanvas), version 1: `lod-meta.json` and a folder of SOG files for each part of each level of
+//! detail.
 //!
-//! `filenames` are the `meta.json` of the pieces, relative to the index; a leaf of `tree` names for each level (`lods`, 0 is
-//! the finest) the `file` and the Gaussians `offset..offset + count` of it; `environment` is one piece more.
+//! `filenames` are the `meta.json` of the parts, relative to the index; a leaf of `tree` names for each level (`lods`,
+//! 0 is the finest) the `file` and the Gaussians `offset..offset + count` of it; `environment` is one more part.
 //! Source: developer.playcanvas.com, "The Streamed SOG Format".
 
 use super::damaged;
@@ -16,16 +17,16 @@ pub const LEVELS: &str = "lod-meta.json";
 /// The version this library reads.
 const VERSION: u64 = 1;
 
-/// The pieces that show a scene in its finest level.
+/// The parts of a scene in its finest level.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Finest {
-    /// `meta.json` of each piece, relative to the index, and the Gaussians of it; none: all.
+    /// `meta.json` of each part, relative to the index, and its Gaussians; none: all.
     pub pieces: Vec<(String, Option<Vec<Range<usize>>>)>,
     /// Levels that the scene has.
     pub levels: usize,
 }
 
-/// Reads the index. Errors: not JSON, another version, no pieces.
+/// Reads the index. Errors: not JSON, another version, no parts.
 pub fn finest(index: &[u8]) -> Result<Finest> {
     let index: Value = serde_json::from_slice(index).map_err(|e| damaged(format!("its {LEVELS} is not JSON: {e}")))?;
     let version = index["version"].as_u64().unwrap_or(VERSION);
@@ -59,7 +60,7 @@ pub fn finest(index: &[u8]) -> Result<Finest> {
     Ok(Finest { pieces, levels })
 }
 
-/// The chosen Gaussians of all pieces, one after the other. Errors: ranges beyond a piece.
+/// The chosen Gaussians of all parts in order. Errors: ranges beyond a part.
 pub fn join(pieces: &[(Params, Option<Vec<Range<usize>>>)]) -> Result<Params> {
     let mut rows: Vec<(usize, usize)> = Vec::new();
     for (i, (params, ranges)) in pieces.iter().enumerate() {
@@ -104,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn the_finest_level_is_joined_from_its_pieces() {
+    fn the_finest_level_is_joined_from_its_parts() {
         let found = finest(index().to_string().as_bytes()).unwrap();
         assert_eq!(found.levels, 2);
         let names: Vec<&str> = found.pieces.iter().map(|(n, _)| n.as_str()).collect();

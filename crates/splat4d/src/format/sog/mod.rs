@@ -2,10 +2,10 @@
 //!
 //! `meta.json` has `version` 2, `count` and for each group the image's `files` and a range or a codebook. Pixel i of a
 //! image belongs to Gaussian i. means_l, means_u: low and high bytes of 16 bits between mins and maxs of
-//! sign(x)·ln(1 + |x|). quats: three parts (b/255·2 − 1)/√2, the fourth byte 252 + index of the largest of (w, x, y, z).
-//! scales: three codes of a codebook of 256 log scales. sh0: three codes of a codebook of f_dc, and opacity. shN: labels of
-//! 16 bits; label l has its coefficients at row l/64, columns (l mod 64)·K on of the centroids, codes of a codebook.
-//! World axes as in .ply: y down. Source: playcanvas/splat-transform (MIT), its reader.
+//! sign(x)·ln(1 + |x|). quats: three parts (b/255·2 − 1)/√2, the fourth byte 252 + index of the largest of (w, x, y,
+//! z). scales: three codes of a codebook of 256 log scales. sh0: three codes of a codebook of f_dc, and opacity. shN:
+//! labels of 16 bits; label l has its coefficients at row l/64, columns (l mod 64)·K on of the centroids, codes of a
+//! codebook. World axes as in .ply: y down. Source: playcanvas/splat-transform (MIT), its reader.
 
 pub mod levels;
 mod pictures;
@@ -40,7 +40,7 @@ pub const DIALECT: Dialect = Dialect {
 
 /// The version this library reads.
 pub(crate) const VERSION: u64 = 2;
-/// The file that states what the others are.
+/// The file that describes the others.
 pub const META: &str = "meta.json";
 /// Most Gaussians that are believed, a byte of the files: real ones take eight bytes and more each.
 const PER_BYTE: usize = 1;
@@ -61,7 +61,7 @@ const ROW_OF_CENTROIDS: usize = 64;
 pub fn unzip(bytes: &[u8]) -> Result<Files<'_>> {
     let archive = zip::Archive::open(bytes)?;
     let names = archive.names();
-    // Some zip a whole folder: names lose what stands before `meta.json`.
+    // Some zip a whole folder: names lose what is before `meta.json`.
     let folders = names.iter().filter_map(|n| n.strip_suffix(META).filter(|f| f.is_empty() || f.ends_with('/')));
     let Some(folder) = folders.min_by_key(|f| f.len()) else {
         return Err(foreign::archive(&names).unwrap_or_else(|| damaged("it has no meta.json")));
@@ -91,7 +91,7 @@ fn count_of(meta: &Value, bytes: usize) -> Result<usize> {
     Ok(count)
 }
 
-/// Names of the images that a `meta.json` speaks of: what a folder's reader must fetch.
+/// Names of the images that a `meta.json` names, which a folder's reader must fetch.
 ///
 /// Errors: not JSON, or another version.
 pub fn files_of(meta: &[u8]) -> Result<Vec<String>> {

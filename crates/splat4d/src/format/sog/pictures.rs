@@ -21,7 +21,7 @@ pub(super) fn most_bytes(count: usize) -> usize {
 /// Which pixels an image must hold.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Needs {
-    /// One a Gaussian.
+    /// One per Gaussian.
     Pixels(usize),
     /// Whatever it has: a palette.
     Palette,

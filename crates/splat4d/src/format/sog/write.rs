@@ -18,9 +18,9 @@ use std::ops::Range;
 const SIDE: usize = 4;
 /// Most entries of a palette: labels have 16 bits.
 const MOST_ENTRIES: usize = 1 << 16;
-/// A palette has this many entries at least, if there are so many Gaussians ...
+/// A palette has this many entries at least, if there are this many Gaussians ...
 const LEAST_ENTRIES: usize = 1024;
-/// ... and an entry for so many of them: what our own format found to lose next to nothing.
+/// ... and an entry for this many of them: what our own format found to lose next to nothing.
 const GAUSSIANS_PER_ENTRY: usize = 8;
 /// Rounds of k-means: of the palette, and of a codebook, whose numbers are sorted and cheap.
 const ROUNDS: usize = 8;
@@ -28,7 +28,7 @@ const BOOK_ROUNDS: usize = 40;
 /// Half of the codes of a part of a quaternion.
 const HALF: f32 = 127.5;
 
-/// Writes a zipped scene. Says what was left out. Errors: no Gaussians; the sink's.
+/// Writes a zipped scene. Returns what was left out. Errors: no Gaussians; the sink's.
 pub(super) fn write(params: &Params, out: &mut dyn Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let mut rows = sound_rows(params, &mut warnings);
@@ -147,7 +147,7 @@ impl Book {
         Self { values }
     }
 
-    /// The nearest number's place.
+    /// The nearest number's position.
     fn code(&self, x: f32) -> u8 {
         let after = self.values.partition_point(|v| *v < x).min(CODES - 1);
         let before = after.saturating_sub(1);
@@ -156,8 +156,8 @@ impl Book {
     }
 }
 
-/// 256 rising numbers: the cell with the largest sum of squares is cut at its mean, until there are so many. Lone numbers far from
-/// the others get a cell of their own, which Lloyd's algorithm would not give them.
+/// 256 rising numbers: the cell with the largest sum of squares is cut at its mean, until there are this many. Lone
+/// numbers far from the others get a cell of their own, which Lloyd's algorithm would not give them.
 fn cells(sorted: &[f32]) -> Vec<f32> {
     let mut sums = vec![[0.0f64; 2]];
     for x in sorted {

@@ -1,8 +1,9 @@
 //! The axes of a file: an extension names them, and without it those of .ply are assumed.
 //!
-//! The SPZ library states "right, up, back" where no extension states otherwise, but five other converters (splat-transform 3.7,
-//! gaussforge 0.6, gsply 0.4, NVIDIA's usd-convert-gsplat 0.1, GaussianSplats3D 0.4) copy the axes of the .ply, so that most
-//! files that people exchange have these. Source of the extension: github.com/nianticlabs/spz (MIT), extensions/README.
+//! The SPZ library states "right, up, back" where no extension states otherwise, but five other converters
+//! (splat-transform 3.7, gaussforge 0.6, gsply 0.4, NVIDIA's usd-convert-gsplat 0.1, GaussianSplats3D 0.4) copy the
+//! axes of the .ply, so that most files that people exchange have these. Source of the extension:
+//! github.com/nianticlabs/spz (MIT), extensions/README.
 
 use crate::format::bytes::Cursor;
 use crate::format::dialect::Y_DOWN;
@@ -78,35 +79,35 @@ impl Axes {
     }
 }
 
-/// Reads the extensions' records, u32 type, u32 length and that many bytes: the axes. Says what is not read.
+/// Reads the extensions' records, u32 type, u32 length and that many bytes: the axes. Reports what is not read.
 pub(super) fn read(bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
     let (mut c, mut axes) = (Cursor::new(bytes, "extensions"), None);
     while let (Ok(kind), Ok(length)) = (c.u32(), c.u32()) {
         let Ok(payload) = c.take(length as usize) else {
-            warnings.say("the file's extensions are cut short");
+            warnings.add("the file's extensions are cut short");
             break;
         };
         if kind != EXTENSION {
-            warnings.say(format!("extension {kind:#010X} is not read"));
+            warnings.add(format!("extension {kind:#010X} is not read"));
             continue;
         }
         let number = payload.first_chunk().map(|b| u32::from_le_bytes(*b));
         axes = number.and_then(Axes::of_number);
         if axes.is_none() {
-            warnings.say("the file's extension for axes (0xADBE0003) names none of the 16 coordinate systems");
+            warnings.add("the file's extension for axes (0xADBE0003) names none of the 16 coordinate systems");
         }
     }
     axes
 }
 
-/// Says what is assumed, makes a left-handed world right-handed, and returns which way is up.
+/// Reports what is assumed, makes a left-handed world right-handed, and returns which way is up.
 pub(super) fn settle(axes: Option<Axes>, params: &mut Params, warnings: &mut Warnings) -> [f64; 3] {
     let Some(axes) = axes else {
-        warnings.say(format!("{ASSUMED}: those of .ply are assumed (y down); --up y or z corrects that"));
+        warnings.add(format!("{ASSUMED}: those of .ply are assumed (y down); --up y or z corrects that"));
         return Y_DOWN;
     };
     if axes.is_mirrored() {
-        warnings.say(format!("the file's axes are left-handed ({}): x is mirrored", axes.name()));
+        warnings.add(format!("the file's axes are left-handed ({}): x is mirrored", axes.name()));
         mirror_x(params);
     }
     axes.up()

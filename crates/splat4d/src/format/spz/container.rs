@@ -20,18 +20,18 @@ const OLD_HEADER: usize = 16;
 const NEW_HEADER: usize = 32;
 /// Bytes of an entry of the table of contents: u64 compressed, u64 plain length.
 const ENTRY: usize = 16;
-/// Most Gaussians that are believed, a byte of the file: real ones take eight bytes and more each. (Deflate and zstd would
-/// allow a thousand times that.)
+/// Most Gaussians that are believed, a byte of the file: real ones take eight bytes and more each. (Deflate and zstd
+/// would allow a thousand times that.)
 const PER_BYTE: usize = 1;
 /// Gaussians that are believed in any case, so that small files of equal Gaussians can be read.
 const ALWAYS: usize = 1 << 16;
 /// Bytes of extensions behind the streams that are inflated to get to the checksum.
 const MOST_TAIL: u64 = 1 << 20;
-/// Largest zstd window that is granted, bytes: what RFC 8878 (3.1.1.1.2) asks every decoder to support. A larger one is
-/// granted up to the plain length.
+/// Largest zstd window that is granted, bytes: the one that RFC 8878 (3.1.1.1.2) requires of every decoder. A larger
+/// one is granted up to the plain length.
 const WINDOW: u64 = 8 << 20;
 
-/// What a file holds.
+/// Content of a file.
 pub(super) struct Opened<'a> {
     pub(super) header: Header,
     pub(super) streams: Streams<'a>,
@@ -174,7 +174,7 @@ fn inflate(packed: &[u8], length: usize) -> Result<Vec<u8>> {
     Ok(plain)
 }
 
-/// The whole file. `extensions`: their records, where the header's flags say that there are any.
+/// The whole file. `extensions`: their records, if the header's flags announce any.
 pub(super) fn close(header: &Header, streams: &Streams<'_>, extensions: &[u8]) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     out.extend(header.version.to_le_bytes());

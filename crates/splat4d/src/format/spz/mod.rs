@@ -2,10 +2,10 @@
 //!
 //! Six streams, one value after the other through all Gaussians: positions (24-bit fixed point), opacities (u8), base
 //! colours (u8, ½ + 0.15·f_dc), log scales (u8, b/16 − 10), rotations, spherical harmonics (u8, (b − 128)/128,
-//! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams; version
-//! 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2 stores the
-//! quaternion's x, y, z; later ones its smallest three parts. World axes: what an extension names, else as in .ply
-//! (`axes.rs`).
+//! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams;
+//! version 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2
+//! stores the quaternion's x, y, z; later ones its smallest three parts. World axes: what an extension names, else as
+//! in .ply (`axes.rs`).
 //!
 //! Source: github.com/nianticlabs/spz (MIT), README and extensions/README.
 
@@ -41,7 +41,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
 
 /// The versions this library reads and writes.
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the streams.
+/// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the
+/// streams.
 const NAMES_AXES: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub(crate) const MAGIC: [u8; 4] = *b"NGSP";
@@ -82,7 +83,7 @@ impl Header {
     fn checked(self) -> Result<Self> {
         if self.version == 1 {
             return Err(Error::new(ErrorKind::Unsupported, "the file has version 1 of .spz, which was never released")
-                .remedy("Export it again with a program of today."));
+                .remedy("Export it again with a current program."));
         }
         if !VERSIONS.contains(&self.version) {
             let what = format!("the file has version {} of .spz, this splat4d reads 2 to 4", self.version);
@@ -109,11 +110,11 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     let mut params = streams::unpack(&header, &streams)?;
     let up = axes::settle(axes, &mut params, &mut warnings);
     if header.degree > crate::math::sh::MAX_DEGREE {
-        warnings.say("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
+        warnings.add("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
     }
     let antialiased = header.flags & ANTIALIASED != 0;
     if antialiased {
-        warnings.say("the file was trained with an anti-aliasing filter: render it with one");
+        warnings.add("the file was trained with an anti-aliasing filter: render it with one");
     }
     let info = SpzInfo {
         version: header.version,
@@ -125,7 +126,8 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     Ok((params, info, warnings))
 }
 
-/// Writes a file of the given version that names its axes, where `up` is along one. Says what was clipped or left out.
+/// Writes a file of the given version that names its axes, where `up` is along one. Returns what was clipped or left
+/// out.
 ///
 /// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
 pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {
@@ -142,7 +144,7 @@ pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl 
     let axes = axes::Axes::of_up(up).filter(|_| version >= NAMES_AXES);
     if axes.is_none() && up != Y_DOWN {
         let what = "the file does not name its axes (version 2, or up lies along none of them)";
-        warnings.say(format!("{what}: other programs will read y as down, as in .ply"));
+        warnings.add(format!("{what}: other programs will read y as down, as in .ply"));
     }
     let flags = if axes.is_some() { EXTENDED } else { 0 };
     let header = Header { version, count: count as usize, degree, fraction_bits, flags };

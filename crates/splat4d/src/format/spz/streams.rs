@@ -151,7 +151,7 @@ pub(super) fn pack(params: &Params, rows: &[usize], header: &Header, warnings: &
     let of = rows.len();
     warnings.counted(far, of, "were outside of the range of .spz, and were moved to its edge");
     if let Some(size) = median_size(params).filter(|size| moved > VISIBLE * size) {
-        warnings.say(format!(
+        warnings.add(format!(
             "positions reach {reach}: the 24 bits of .spz leave steps of {}, and moved them by up to {moved:.3}, {:.2} of the \
              size of the median Gaussian. Move the scene to the origin first, or write .ply",
             1.0 / per_unit,

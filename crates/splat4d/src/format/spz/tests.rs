@@ -5,7 +5,7 @@ use crate::scene::GEOMETRY;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use std::io::Read;
 
-/// The body of one Gaussian of degree 1 as the specification has it; `rotation` as the version stores it.
+/// The body of one Gaussian of degree 1 as specified; `rotation` as stored by the version.
 fn body(rotation: &[u8]) -> Vec<u8> {
     let mut b = Vec::new();
     // x = 1.5, y = -0.25, z = 2048 − 1/4096, in steps of 1/4096.
@@ -152,7 +152,7 @@ fn version_4_by_hand() {
 }
 
 #[test]
-fn every_version_and_degree_comes_back_within_its_steps() {
+fn every_version_and_degree_round_trips_within_its_steps() {
     for version in VERSIONS {
         for coefficients in [1, 4, 9, 16] {
             let p = gaussians(700, coefficients);
@@ -208,7 +208,7 @@ fn files_store_the_up_direction_except_in_version_2() {
 }
 
 #[test]
-fn what_is_clipped_is_counted() {
+fn clipped_values_are_counted() {
     let mut p = gaussians(4, 4);
     p[GEOMETRY].set(0, 0, 1e9);
     p[GEOMETRY].set(1, LOG_SCALE, -11.0);

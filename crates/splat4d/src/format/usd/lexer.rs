@@ -6,7 +6,7 @@ use crate::Result;
 /// Deepest nesting of brackets that is followed.
 const DEEPEST: usize = 128;
 
-/// A value as far as Gaussians and their places need it.
+/// A value as far as Gaussians and their positions need it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Value {
     /// A number, a truth or a tuple (of tuples).
@@ -37,7 +37,7 @@ impl Value {
     }
 }
 
-/// A place in the text.
+/// A position in the text.
 pub(super) struct Lexer<'a> {
     text: &'a [u8],
     at: usize,
@@ -48,7 +48,7 @@ impl<'a> Lexer<'a> {
         Self { text, at: 0 }
     }
 
-    /// The byte that comes next; 0 at the end.
+    /// The next byte; 0 at the end.
     pub(super) fn peek(&self) -> u8 {
         self.text.get(self.at).copied().unwrap_or(0)
     }
@@ -78,21 +78,21 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Goes behind the next `end`, or to the end of the text.
+    /// Moves behind the next `end`, or to the end of the text.
     fn until(&mut self, end: &[u8]) {
         let rest = &self.text[self.at..];
         let found = rest.windows(end.len()).position(|w| w == end);
         self.at += found.map_or(rest.len(), |i| i + end.len());
     }
 
-    /// Passes over a byte if it comes next.
+    /// Skips a byte if it is the next one.
     pub(super) fn eat(&mut self, byte: u8) -> bool {
         let is = self.peek() == byte && self.at < self.text.len();
         self.at += usize::from(is);
         is
     }
 
-    /// Passes over a byte that must come next.
+    /// Skips a byte that must be the next one.
     pub(super) fn expect(&mut self, byte: u8) -> Result<()> {
         if self.eat(byte) { Ok(()) } else { Err(self.error(format_args!("`{}` is missing", char::from(byte)))) }
     }
@@ -262,7 +262,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Time samples: code and value, which `keep` gets in turn. Codes that are not numbers are an error.
+    /// Time samples: code and value, passed to `keep` in order. Codes that are not numbers are an error.
     pub(super) fn samples(&mut self, mut keep: impl FnMut(f64, Value)) -> Result<()> {
         self.space();
         self.expect(b'{')?;

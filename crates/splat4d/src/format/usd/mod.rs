@@ -2,9 +2,9 @@
 //! such a layer (`.usdz`).
 //!
 //! `positions`, `orientations` (w first in text), `scales` (lengths) and `opacities` (alpha) are **activated**;
-//! `radiance:sphericalHarmonicsCoefficients` are (degree + 1)² colours a Gaussian, Gaussian after Gaussian, with the signs
-//! of 3DGS. Every array may have time samples, between which programs interpolate: one row is one Gaussian at all times,
-//! with opacity 0 while it does not live. Transforms of parents place the field. `upAxis` is Y or Z.
+//! `radiance:sphericalHarmonicsCoefficients` are (degree + 1)² colours a Gaussian, Gaussian after Gaussian, with the
+//! signs of 3DGS. Every array may have time samples, between which programs interpolate: one row is one Gaussian at all
+//! times, with opacity 0 while it is not alive. Transforms of parents place the field. `upAxis` is Y or Z.
 //! Sources: openusd.org, "usda" grammar of the User Guides, usdVol schemas, usdz specification 1.3.
 
 mod lexer;
@@ -77,7 +77,7 @@ fn is_archive(bytes: &[u8]) -> bool {
 fn read_archive(bytes: &[u8]) -> Result<Opened> {
     let archive = zip::Archive::open(bytes)?;
     let name = archive.first().ok_or_else(|| damaged("the archive is empty"))?.to_owned();
-    // An archive of USD stores its files as they are.
+    // An archive of USD stores its files uncompressed.
     let most = archive.packed(&name).unwrap_or(0);
     let layer = archive.file(&name, most).expect("it is one of the names")?;
     if layer.starts_with(BINARY) {
@@ -93,7 +93,7 @@ fn write_archive(scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write
     Ok(warnings)
 }
 
-/// What to do with a layer that is not text.
+/// Error for a layer that is not text.
 fn binary() -> Error {
     Error::new(ErrorKind::Unsupported, "the layer is binary (.usdc), which is not read").remedy(
         "Convert it to text with `usdcat IN.usdc -o OUT.usda`, or in Python: Usd.Stage.Open('IN.usdc').Export('OUT.usda').",

@@ -1,4 +1,4 @@
-//! Fields of Gaussians as a scene: static ones as they are, animated ones as segments between their time samples.
+//! Fields of Gaussians as a scene: static ones unchanged, animated ones as segments between their time samples.
 
 use super::lexer::Value;
 use super::stage::{Attribute, Prim, Stage};
@@ -20,7 +20,8 @@ use std::sync::Arc;
 
 /// Up in stages with z up.
 const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
-/// A segment begins this share of a frame before its time sample, so that rounding of times does not choose the one before.
+/// A segment begins this share of a frame before its time sample, so that rounding of times does not choose the one
+/// before.
 const EARLY: f64 = 1e-6;
 /// Most time samples of a field.
 const MOST_TIMES: usize = 100_000;
@@ -34,7 +35,7 @@ pub(super) fn opened(stage: &Stage) -> Result<Opened> {
     for (i, prim) in stage.prims.iter().enumerate().filter(|(_, p)| p.shown && p.kind == FIELD) {
         let (frame, moves) = stage.place(i)?;
         if moves {
-            warnings.say(format!("a transform of {} is animated: its first time sample is read", prim.name));
+            warnings.add(format!("a transform of {} is animated: its first time sample is read", prim.name));
         }
         let field = Field::of(prim, stage.codes_per_second).map_err(|e| e.at(format!("prim {}", prim.name)))?;
         if let [first, .., last] = field.times[..] {
@@ -54,7 +55,7 @@ pub(super) fn opened(stage: &Stage) -> Result<Opened> {
     }
     let unit = stage.meters_per_unit;
     if unit.is_finite() && unit != 1.0 {
-        warnings.say(format!("the file's unit is {unit} m: coordinates are read as they are"));
+        warnings.add(format!("the file's unit is {unit} m: coordinates are read as they are"));
     }
     if layers.len() > 1 && clip.is_none() {
         layers.iter_mut().enumerate().for_each(|(i, l)| l.name = format!("gaussians {i}"));
@@ -160,7 +161,7 @@ impl<'a> Field<'a> {
             let long = values.as_ref().is_some_and(|v| v.len() >= width * count);
             if !long && count > 0 {
                 let mut one = Warnings::default();
-                one.say(format!("{name} are missing or fewer than {POSITIONS}: the schema's fallback is used"));
+                one.add(format!("{name} are missing or fewer than {POSITIONS}: the schema's fallback is used"));
                 warnings.append(one);
             }
             values.filter(|_| long)
@@ -192,7 +193,7 @@ impl<'a> Field<'a> {
 
     fn layers(&self, warnings: &mut Warnings) -> Result<Vec<Layer<f32>>> {
         if self.degree > MAX_DEGREE && self.coefficients.is_some() {
-            warnings.say(format!("spherical harmonics above degree {MAX_DEGREE} are left out"));
+            warnings.add(format!("spherical harmonics above degree {MAX_DEGREE} are left out"));
         }
         let first = self.params(self.times[0], warnings)?;
         if self.times.len() == 1 {
@@ -222,7 +223,7 @@ impl<'a> Field<'a> {
         Ok(layers)
     }
 
-    /// Positions and rotations that move, all else as it is.
+    /// Positions and rotations that move, all else unchanged.
     fn tracked(&self, first: Params, warnings: &mut Warnings) -> Result<Layer<f32>> {
         let mut params = first;
         let spec = TrackedSpec { times: self.times.clone(), foreground: false };

@@ -7,9 +7,9 @@ use std::collections::BTreeMap;
 
 /// Deepest nesting of prims that is followed.
 const DEEPEST: usize = 64;
-/// Time codes a second where the file does not say it (USD's fallback).
+/// Time codes per second where the file does not state it (USD's fallback).
 const CODES_PER_SECOND: f64 = 24.0;
-/// Words that may stand before the type of a property.
+/// Words that may be before the type of a property.
 const QUALIFIERS: [&str; 7] = ["custom", "uniform", "varying", "config", "prepend", "append", "add"];
 
 /// An attribute.
@@ -34,7 +34,7 @@ pub(super) struct Prim {
     pub(super) attributes: BTreeMap<String, Attribute>,
 }
 
-/// A layer. Parents stand before their children.
+/// A layer. Parents are before their children.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Stage {
     pub(super) z_up: bool,
@@ -52,8 +52,8 @@ impl Default for Stage {
     }
 }
 
-/// Whether an attribute is one of a field of Gaussians or of a place.
-fn is_wanted(name: &str) -> bool {
+/// Whether an attribute is one of a field of Gaussians or of a position.
+fn is_needed(name: &str) -> bool {
     let name = name.strip_suffix('h').unwrap_or(name);
     [POSITIONS, ORIENTATIONS, SCALES, OPACITIES, DEGREE, COEFFICIENTS, "visibility"].contains(&name)
         || name.starts_with("xformOp")
@@ -74,7 +74,7 @@ impl Stage {
                 break;
             }
             if l.eat(b'}') {
-                open.pop().ok_or_else(|| l.error("a bracket closes that none opened"))?;
+                open.pop().ok_or_else(|| l.error("a closing bracket has no opening one"))?;
                 continue;
             }
             match l.word() {
@@ -100,10 +100,10 @@ impl Stage {
                         }
                     }
                 }
-                "" => return Err(l.error(format_args!("`{}` stands where a name should", char::from(l.peek())))),
+                "" => return Err(l.error(format_args!("expected a name, found `{}`", char::from(l.peek())))),
                 first => {
                     let Some(&prim) = open.last() else {
-                        return Err(l.error(format_args!("`{first}` stands outside of all prims")));
+                        return Err(l.error(format_args!("`{first}` is outside all prims")));
                     };
                     stage.prims[prim].property(&mut l, first)?;
                 }
@@ -219,7 +219,7 @@ impl Prim {
         let name = if words.len() == 2 { words[1] } else { "" };
         if l.eat(b'=') {
             let (name, part) = name.split_once('.').map_or((name, ""), |(name, part)| (name, part));
-            if !is_wanted(name) || !matches!(part, "" | "timeSamples") {
+            if !is_needed(name) || !matches!(part, "" | "timeSamples") {
                 l.skip()?;
                 // `rel a = </b>, </c>` does not occur without brackets; strings may follow each other by commas only.
             } else if part.is_empty() {

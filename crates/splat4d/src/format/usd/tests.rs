@@ -24,7 +24,7 @@ fn error(text: &str) -> String {
 }
 
 #[test]
-fn static_gaussians_come_back_from_text_and_archive() {
+fn static_gaussians_round_trip_as_text_and_archive() {
     let p = gaussians(40, 16);
     for dialect in [TEXT, ARCHIVE] {
         let bytes = written(dialect, &still(p.clone()));
@@ -38,7 +38,7 @@ fn static_gaussians_come_back_from_text_and_archive() {
 }
 
 #[test]
-fn every_frame_of_an_animated_scene_comes_back() {
+fn every_frame_of_an_animated_scene_round_trips() {
     let scene = Scene { up: Y_UP, ..moving(30, LifeKind::GaussHalf, 3, true) };
     let bytes = written(ARCHIVE, &scene);
     let back = ARCHIVE.open(&bytes).unwrap().scene;
@@ -241,7 +241,7 @@ fn damaged_files_never_panic() {
 }
 
 #[test]
-fn what_changes_is_sampled_and_what_does_not_is_not() {
+fn only_changing_attributes_are_sampled() {
     let scene = Scene { up: Y_UP, ..moving(20, LifeKind::GaussHalf, 1, false) };
     let text = String::from_utf8(written(TEXT, &scene)).unwrap();
     for (name, sampled) in [("positions", true), ("opacities", true), ("scales", false), ("orientations", false)] {

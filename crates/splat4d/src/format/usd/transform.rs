@@ -1,4 +1,4 @@
-//! Where the transforms of a prim and its parents place it.
+//! Placement of a prim by its transforms and those of its parents.
 
 use super::lexer::Value;
 use super::stage::{Prim, Stage};
@@ -15,7 +15,7 @@ const RESET: &str = "!resetXformStack!";
 const INVERSE: &str = "!invert!";
 
 impl Stage {
-    /// The place of a prim in the world; whether a transform has time samples, of which the first counts.
+    /// The position of a prim in the world; whether a transform has time samples, of which the first counts.
     pub(super) fn place(&self, prim: usize) -> Result<(Sim3, bool)> {
         let (mut frame, mut moves, mut at) = (Sim3::IDENTITY, false, Some(prim));
         while let Some(i) = at {
@@ -84,7 +84,7 @@ fn operation(name: &str, v: &[f64]) -> Result<Sim3> {
             Ok(Sim3::from_rotation(rotation))
         }
         ("transform", m) if m.len() == 16 => {
-            // Row vectors: rows are the axes, the last one the place.
+            // Row vectors: rows are the axes, the last one the position.
             let lengths: Vec<f64> = (0..3).map(|r| (0..3).map(|c| m[4 * r + c].powi(2)).sum::<f64>().sqrt()).collect();
             if lengths.iter().any(|l| (l - lengths[0]).abs() > UNIFORM * lengths[0]) {
                 return Err(unsupported(format!("{name} scales axes differently")));

@@ -37,7 +37,7 @@ pub(super) fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Wr
     warnings.counted(scene.len() - frames.len(), scene.len(), "are never visible at a frame and were left out");
     let axis = if aligned(options.up, [0.0, 0.0, 1.0]) { "Z" } else { "Y" };
     if axis == "Y" && !aligned(options.up, [0.0, 1.0, 0.0]) {
-        warnings.say("USD has y up and z up only: the file states y up, but the scene's up direction is another one");
+        warnings.add("USD has y up and z up only: the file states y up, but the scene's up direction is another one");
     }
     let survey = Survey::of(&mut frames);
     let codes: Vec<f64> = frames.times().iter().map(|t| code(t * fps)).collect();
@@ -130,7 +130,7 @@ fn opacity(p: &Params, row: usize) -> f32 {
     if logit <= HIDDEN { 0.0 } else { 1.0 / (1.0 + (-logit).exp()) }
 }
 
-/// What changes over the clip, and its box.
+/// Attributes that change over the clip, and its box.
 struct Survey {
     varies: [bool; ARRAYS.len()],
     extent: [[f32; 3]; 2],

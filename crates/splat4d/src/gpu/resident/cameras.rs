@@ -1,4 +1,4 @@
-//! The cameras' colour matrices, as record.wgsl has them.
+//! The cameras' colour matrices, as in record.wgsl.
 
 use crate::Result;
 use crate::gpu::buffers::Grown;
@@ -7,7 +7,7 @@ use crate::gpu::device::Gpu;
 use crate::render::ResidentCameras;
 use crate::scene::BLOCK;
 
-/// Matrices, gradients, first and second moments; then a step count and a mark a camera.
+/// Matrices, gradients, first and second moments; then a step count and a mark per camera.
 const PARTS: usize = 4;
 
 /// See the module's documentation.
@@ -17,7 +17,7 @@ pub(super) struct Cameras {
     buffer: Grown,
 }
 
-/// Place of a number in a table of so many columns.
+/// Place of a number in a table of this many columns.
 fn place(row: usize, column: usize, width: usize) -> usize {
     (row / BLOCK * width + column) * BLOCK + row % BLOCK
 }

@@ -1,4 +1,5 @@
-//! Frames one after the other of a scene that stays on the GPU, none of them read back: how fast a screen could show them.
+//! Frames one after the other of a scene that stays on the GPU, none of them read back: how fast a screen could show
+//! them.
 
 use super::{Tables, at};
 use crate::Result;
@@ -11,12 +12,12 @@ use crate::scene::{Camera, Splats, Time};
 use std::collections::VecDeque;
 use std::time::Instant;
 
-/// Frames that are under way at most, as on a screen with three images.
+/// Frames that are in flight at most, as on a screen with three images.
 const FRAMES: usize = 3;
-/// The step of which the frames are a view, as far as room for pairs goes.
+/// The step that the frames belong to, for the capacity for pairs.
 const VIEW: u32 = 1;
 
-/// What is filmed.
+/// Content of a film.
 struct Film<'a> {
     alpha_min: f64,
     background: [f32; 3],
@@ -24,8 +25,9 @@ struct Film<'a> {
 }
 
 impl GpuRenderer {
-    /// Draws frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the first submission to the end of the last.
-    /// `None`: an image must be drawn in bands. Errors: a driver that failed.
+    /// Renders frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the
+    /// first submission to the end of the last. `None`: an image must be rendered in bands. Errors: a driver that
+    /// failed.
     pub fn film(
         &mut self,
         layers: &[ResidentLayer<'_>],
@@ -36,7 +38,7 @@ impl GpuRenderer {
         let film = Film { alpha_min, background, frames };
         self.keep(layers, None, &[[1.0; 2]])?;
         loop {
-            // Once to make room, and once for the clock.
+            // Once as a warm-up, and once for the measurement.
             for measured in [false, true] {
                 let seconds = self.with_tables(|renderer, tables| renderer.show(tables, &film))?;
                 let [_, _, _, stop, wanted] = self.counts()?;
@@ -70,7 +72,7 @@ impl GpuRenderer {
             if fresh || self.groups.is_none() {
                 self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
             }
-            tables.write_asks(&self.gpu, *t, film.alpha_min);
+            tables.write_queries(&self.gpu, *t, film.alpha_min);
             let shot = Shot::new(&nothing, camera, film.background);
             self.write_uniforms(&shot, band, across, Way { view: VIEW, ..Way::default() })?;
             let mut recorder = Recorder::new(&self.gpu, &self.queries, StageClock::Off);
@@ -95,14 +97,14 @@ impl GpuRenderer {
 }
 
 impl Tables {
-    /// Writes what is asked at a time, and nothing by which anything would learn.
-    fn write_asks(&self, gpu: &crate::gpu::Gpu, t: Time, alpha_min: f64) {
+    /// Writes the queries at a time, without rules of learning.
+    fn write_queries(&self, gpu: &crate::gpu::Gpu, t: Time, alpha_min: f64) {
         let mut out = vec![0u8; self.pages.len() * at::ALL * UNIFORM_STRIDE as usize];
         let mut first_splat = 0;
         for (i, page) in self.pages.iter().enumerate() {
-            let ask = super::Ask::new(page, t, true, alpha_min, first_splat);
-            let bytes = bytemuck::bytes_of(&ask);
-            out[(i * at::ALL + at::ASK) * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
+            let query = super::Query::new(page, t, true, alpha_min, first_splat);
+            let bytes = bytemuck::bytes_of(&query);
+            out[(i * at::ALL + at::QUERY) * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
             first_splat += page.rows;
         }
         gpu.queue.write_buffer(self.uniforms.get(), 0, &out);

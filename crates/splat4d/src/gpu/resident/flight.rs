@@ -1,10 +1,9 @@
-//! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record (record.wgsl).
+//! Steps in flight: begun without a wait, and done some steps later, when the GPU has written their record
+//! (record.wgsl).
 //!
-//! Where a view has more pairs than there is room for, the GPU stops: nothing that follows is applied, neither of that step nor of
-//! those behind it, which may have been begun already. Who reads the record gives more room, or cuts images into
-//! more bands, and
-//! begins again from that very view on. A step is a function of what it was begun with, so that neither the room nor
-//! the moment at
+//! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that step nor of later ones,
+//! which may already be in flight. The reader of the record enlarges the buffers, or cuts images into more bands, and
+//! starts again from that view. A step is a function of its inputs, so that neither the buffer size nor the time at
 //! which its record is read changes a bit.
 
 use super::{ResidentPass, STEP_WORDS, Tables, VIEW_WORDS};
@@ -19,10 +18,10 @@ use crate::scene::{Camera, Splats, Time};
 use crate::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
 
-/// Steps that are under way at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that what they
-/// hold (an image each, where images are not kept) is little.
+/// Steps that are in flight at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that
+/// what they hold (an image each, where images are not kept) is little.
 pub(in crate::gpu) const AHEAD: usize = 8;
-/// What stops steps because a number is none (record.wgsl).
+/// Flag that stops steps because of a non-finite number (record.wgsl).
 const NOT_FINITE: u32 = u32::MAX;
 
 /// A view of a step that was begun.
@@ -33,7 +32,7 @@ pub(super) struct PendingView {
     background: [f32; 3],
     held: Held,
     dssim: f64,
-    /// Number of the camera; one past all where it shows what is drawn.
+    /// Number of the camera; one past all where it shows what is rendered.
     pub rig: usize,
 }
 
@@ -49,7 +48,7 @@ pub(super) struct Begun {
     pub cameras: f64,
 }
 
-/// A step under way.
+/// A step in flight.
 #[derive(Debug)]
 struct Flight {
     step: Begun,
@@ -69,7 +68,7 @@ pub(in crate::gpu) struct Flights {
     done: Vec<ResidentStepped>,
     /// Memory of records that are not in use.
     spare: Vec<Grown>,
-    /// Steps that were begun again for want of room.
+    /// Steps that were restarted because buffers were too small.
     #[cfg(test)]
     pub again: usize,
 }
@@ -81,7 +80,7 @@ struct Record {
 }
 
 impl GpuRenderer {
-    /// Does something with the tables that stay, whose drawn parts take the place of the last scene's meanwhile.
+    /// Does something with the tables that stay, whose rendered parts take the place of the last scene's meanwhile.
     pub(super) fn with_tables<T>(&mut self, f: impl FnOnce(&mut Self, &Tables) -> T) -> T {
         let mut tables = self.resident.take().expect("tables are kept before steps are taken");
         std::mem::swap(&mut self.upload, &mut tables.upload);
@@ -102,14 +101,14 @@ impl GpuRenderer {
         Ok(Some(std::mem::take(&mut self.flights.done)))
     }
 
-    /// A buffer of the status of steps of so many views.
+    /// A buffer of the status of steps of this many views.
     pub(super) fn make_room_for_status(&mut self, views: usize) -> Result<()> {
         let tables = self.resident.as_ref().expect("tables are kept before steps are taken");
         let bytes = 4 * tables.status(views).words as u64;
         if tables.status.bytes() >= bytes {
             return Ok(());
         }
-        // Those under way write into the old one.
+        // Those in flight write into the old one.
         while !self.flights.under_way.is_empty() {
             self.land()?;
         }
@@ -125,7 +124,7 @@ impl GpuRenderer {
         Ok(std::mem::take(&mut self.flights.done))
     }
 
-    /// Waits for all work, whatever came of it.
+    /// Waits for all work, whatever its result.
     pub(super) fn forget_flights(&mut self) -> Result<()> {
         self.flights.done.clear();
         if self.flights.under_way.is_empty() {
@@ -201,8 +200,8 @@ impl GpuRenderer {
         unreachable!("a step has a last view")
     }
 
-    /// Submits a view of a step, and, after its last, what it leaves: so many bytes of its status, and behind them its times.
-    /// Returns the last work, and the stages that are timed.
+    /// Submits a view of a step, and, after its last, what it leaves: this many bytes of its status, and behind them
+    /// its times. Returns the last work, and the stages that are timed.
     fn submit_view(
         &mut self,
         pass: &ResidentPass<'_>,
@@ -291,7 +290,7 @@ impl GpuRenderer {
         Back { frame: self.frame(), kernels, pairs }
     }
 
-    /// Waits for the oldest step, which is begun again while there is too little room for it.
+    /// Waits for the oldest step, which is restarted while its buffers are too small.
     fn land(&mut self) -> Result<()> {
         loop {
             let Some(flight) = self.flights.under_way.pop_front() else { return Ok(()) };
@@ -309,13 +308,13 @@ impl GpuRenderer {
                     self.flights.done.push(stepped);
                     return Ok(());
                 }
-                view => self.begin_anew(step, view as usize - 1, record.words[1] as usize)?,
+                view => self.begin_again(step, view as usize - 1, record.words[1] as usize)?,
             }
         }
     }
 
-    /// More room, then a step from a view on that had so many pairs, and all steps behind it.
-    fn begin_anew(&mut self, step: Begun, view: usize, pairs: usize) -> Result<()> {
+    /// Enlarges buffers, then restarts a step from the view with this many pairs, and all later steps.
+    fn begin_again(&mut self, step: Begun, view: usize, pairs: usize) -> Result<()> {
         let mut steps = vec![step];
         self.gpu.wait()?;
         while let Some(Flight { step, record, .. }) = self.flights.under_way.pop_front() {
@@ -360,7 +359,7 @@ impl GpuRenderer {
         self.gpu.queue.write_buffer(self.buffers.counts.get(), 4 * count::STOP as u64, &zeros);
     }
 
-    /// What the GPU has written of a step.
+    /// The GPU's record of a step.
     fn read_record(&self, flight: &Flight) -> Result<Record> {
         self.gpu.wait_for(&flight.work)?;
         let lost = |e: wgpu::MapRangeError| {
@@ -396,4 +395,4 @@ impl GpuRenderer {
     }
 }
 
-const _: () = assert!(RESPONSES == 12, "record.wgsl has so many columns a camera");
+const _: () = assert!(RESPONSES == 12, "record.wgsl has this many columns per camera");

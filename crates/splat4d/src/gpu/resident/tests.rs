@@ -1,4 +1,4 @@
-//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of what numbers can stand too.
+//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of the number range too.
 
 use super::*;
 use crate::gpu::MOST_PAIRS;
@@ -17,7 +17,8 @@ const ROWS: usize = 500;
 /// Largest difference of a column, of the root of the mean square of its numbers.
 const COLUMN: f64 = 1e-4;
 
-/// Thin and thick, short-lived and long-lived ones, some beyond the floor and the ceiling, some with no rotation at all.
+/// Thin and thick, short-lived and long-lived ones, some beyond the floor and the ceiling, some with no rotation at
+/// all.
 fn params<F: Real>(spec: &Native4dSpec) -> (Params<F>, Key, Arc<dyn Motion<F>>) {
     let mut p = Params::<F>::new(ROWS, 1, &[]);
     let motion = build_as(&Spec::Native4d(*spec), &mut p).expect("a sound specification");
@@ -37,7 +38,7 @@ fn params<F: Real>(spec: &Native4dSpec) -> (Params<F>, Key, Arc<dyn Motion<F>>) 
     (p, own, motion)
 }
 
-/// The motion as kernels know it.
+/// The motion as in the kernels.
 fn moves<F: Real>(motion: &dyn Motion<F>) -> Moves {
     let Slices { speed, floor, ceiling, harmonics, period, .. } = motion.slices().expect("it is of slices");
     Moves::Sliced { speed, floor, ceiling, harmonics, period }
@@ -53,26 +54,26 @@ fn compare(what: &str, got: &[f64], expected: &[f64]) {
 }
 
 #[test]
-fn slices_equal_the_model_forth_and_back() {
+fn slices_equal_the_model_forward_and_backward() {
     let Some(mut r) = renderer() else { return };
     let spec = Native4dSpec { speed: 2.0, min_life: 0.05, max_life: 3.0, ..Native4dSpec::default() };
     let ((single, own, _), (double, _, motion), t) = (params::<f32>(&spec), params::<f64>(&spec), 0.125);
-    // The answer and its gradients, in f64.
-    let question = At { p: &double, of: Space::Gaussians, rows: Rows::All, t: Time(t) };
+    // The result and its gradients, in f64.
+    let query = At { p: &double, of: Space::Gaussians, rows: Rows::All, t: Time(t) };
     let (mut tape, mut d) = (Tape::default(), Grads::new(&double));
-    motion.at(&question, &Cache::default(), &mut tape);
+    motion.at(&query, &Cache::default(), &mut tape);
     let mut pulled = Table::<f64>::new(&crate::scene::splats::SPLAT_COLUMNS, ROWS);
     let mut back = Vec::new();
     for row in 0..ROWS {
         let rng = Rng::new(4, "pulled", row as u64);
         let g: [f32; 10] = std::array::from_fn(|c| rng.normal(c as u64) as f32);
         pulled.write(row, 0, g.map(f64::from));
-        // Mean and opacity, covariance; nothing was drawn, so that colours add nothing.
+        // Mean and opacity, covariance; nothing was rendered, so that colours add nothing.
         back.extend([g[0], g[1], g[2], g[9], g[3], g[4], g[5], g[6], g[7], g[8], 0.0, 0.0].into_iter().chain([0.0; 8]));
     }
     d.activate(Space::Gaussians, Rows::All);
     let d_out = SplatGrads { out: &pulled, color: None, weights: None };
-    motion.backward(&question, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
+    motion.backward(&query, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
     // The same by the kernels: the first of two views, after which nothing learns.
     let moves = moves(motion.as_ref());
     let table = |key: Key| ResidentTable { width: single[key].width(), params: single[key].data(), moments: &[] };
@@ -162,7 +163,7 @@ fn kept(r: &mut GpuRenderer, ties: Option<&ResidentTies>) -> Result<Params<f32>>
     Ok(p)
 }
 
-/// Begins a step that sees these cameras, with losses on rows and noise: steps that are done.
+/// Begins a step on these cameras, with losses on rows and noise: steps that are done.
 fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<ResidentStepped>> {
     let truth = |camera: &Camera| {
         let mut truth = Planes::new(3, camera.height, camera.width);
@@ -229,19 +230,19 @@ fn tunings_change_no_bit() {
     }
 }
 
-/// Images of few pairs, then of more than there was room for, at a first view and at a later one.
+/// Images of few pairs, then of more than fit, at a first view and at a later one.
 fn far_and_near() -> [Vec<Camera>; 3] {
     let [far, near] = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
     [vec![far.clone(), far.clone()], vec![far.clone(), near.clone()], vec![near, far]]
 }
 
 #[test]
-fn steps_under_way_room_bands_and_pages_change_no_bit() {
+fn steps_in_flight_buffer_sizes_bands_and_pages_change_no_bit() {
     let Some(mut r) = own_renderer() else { return };
     let [first, then, last] = far_and_near();
     let steps: Vec<(&[Camera], f64)> =
         [&first, &first, &then, &first, &last, &then, &first].iter().map(|c| (&c[..], 0.01)).collect();
-    // One after the other, with all the room they want.
+    // One after the other, with buffers as large as needed.
     r.ahead = 0;
     stepped(&mut r, &steps);
     let (again, pairs) = (r.flights.again, r.pair_capacity());
@@ -305,16 +306,16 @@ fn a_non_finite_value_stops_later_steps_and_its_step_is_reported() {
 }
 
 #[test]
-fn a_device_that_is_lost_under_way_is_an_error() {
+fn a_device_lost_during_a_step_is_an_error() {
     let Some(mut r) = own_renderer() else { return };
     let camera = camera([0.0, 0.0, -4.0], 33, 20);
     stepped(&mut r, &one(&camera));
     r.gpu.device.destroy();
-    assert!(tried(&mut r, &one(&camera)).is_err(), "it is told");
+    assert!(tried(&mut r, &one(&camera)).is_err(), "an error is returned");
 }
 
-/// Something that is asked of a renderer.
-type Asked<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
+/// A request to a renderer.
+type Call<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
 
 #[test]
 fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
@@ -322,18 +323,18 @@ fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
     let finish = |r: &mut GpuRenderer| r.finish().map(|_| ());
     let fetch = |r: &mut GpuRenderer| r.fetch(0).map(|_| ());
     let step = |r: &mut GpuRenderer, number| begun(r, number, std::slice::from_ref(&camera), 0.01);
-    // As many as may be under way, and one.
+    // As many as may be in flight, and one.
     let more = |r: &mut GpuRenderer| (2..=r.ahead).try_for_each(|number| step(r, number).map(|_| ()));
-    let ways: [Asked<'_>; 3] = [&finish, &fetch, &more];
-    for (what, ask) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {
+    let ways: [Call<'_>; 3] = [&finish, &fetch, &more];
+    for (what, call) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {
         let Some(mut r) = own_renderer() else { return };
         stepped(&mut r, &one(&camera));
         for number in 0..2 {
             assert!(step(&mut r, number).expect("it is begun").is_empty(), "it is under way");
         }
         r.gpu.device.destroy();
-        assert!(ask(&mut r).is_err(), "{what}: it is told");
-        assert!(tried(&mut r, &one(&camera)).is_err(), "{what}: and told again");
+        assert!(call(&mut r).is_err(), "{what}: an error is returned");
+        assert!(tried(&mut r, &one(&camera)).is_err(), "{what}: and the error is returned again");
     }
 }
 
@@ -373,7 +374,7 @@ fn failed_allocations_drop_cached_images_first_then_are_errors() {
 }
 
 #[test]
-fn a_film_shows_what_an_image_does() {
+fn a_film_equals_the_images() {
     let Some(mut r) = own_renderer() else { return };
     let (p, _, motion) = params::<f32>(&Native4dSpec::default());
     let layer = Layer::new("all", p, motion, LifeKind::Infinite);

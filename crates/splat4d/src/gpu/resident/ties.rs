@@ -1,4 +1,4 @@
-//! What holds the poses of a tracked frame, in buffers.
+//! Ties of the poses of a tracked frame, in buffers.
 
 use super::uniforms::TieRule;
 use crate::Result;

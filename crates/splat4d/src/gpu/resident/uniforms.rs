@@ -6,15 +6,15 @@ use crate::scene::{LifeKind, Time};
 
 /// Most columns that Adam takes at once (adam.wgsl).
 pub(super) const MOST_COLUMNS: usize = 48;
-/// Bits of `Ask::flags` (learnt.wgsl).
+/// Bits of `Query::flags` (learnt.wgsl).
 const FLAG_ROTATION: u32 = 1;
 const FLAG_DETACH: u32 = 2;
 const FLAG_FIRST: u32 = 4;
 
-/// `struct Ask` of learnt.wgsl.
+/// `struct Query` of learnt.wgsl.
 #[repr(C)]
 #[derive(Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
-pub(super) struct Ask {
+pub(super) struct Query {
     rows: u32,
     width: u32,
     order: u32,
@@ -40,7 +40,7 @@ pub(super) struct Ask {
     unused: [u32; 2],
 }
 
-impl Ask {
+impl Query {
     /// At a time; `first`: of a step's first view.
     pub(super) fn new(layer: &ResidentBuffers, at: Time, first: bool, alpha_min: f64, first_splat: usize) -> Self {
         let flag = |on: bool, flag: u32| if on { flag } else { 0 };

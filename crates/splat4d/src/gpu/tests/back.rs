@@ -7,9 +7,9 @@ use frame::RECORD_BYTES;
 
 /// Largest difference of a pair's sum from the same sum in f64, of the root of the mean square of all pairs' sums.
 const RECORD: f64 = 1e-3;
-/// Largest relative difference of a gradient, as a vector, where both draw the same lists: roundings.
+/// Largest relative difference of a gradient, as a vector, where both render the same lists: rounding.
 const VECTOR: f64 = 1e-4;
-/// Of the whole chain, where a splat at the α cut-off may be drawn by one side only.
+/// Of the whole chain, where a splat at the α cut-off may be rendered by one side only.
 const CHAIN: f64 = 2e-3;
 
 /// A gradient to an image: of both signs, different in all planes.
@@ -96,7 +96,7 @@ fn named(d: &RenderGrads<f32>, d_sh: &[Option<Table<f32>>]) -> Vec<(String, Vec<
     out
 }
 
-/// Asserts that both go back alike. Returns the worst relative difference.
+/// Asserts equal gradients. Returns the worst relative difference.
 fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, grads: &ImageGrads<'_, f32>, what: &str) -> f64 {
     let (_, d, d_sh) = back(r, shot, grads);
     let mut cpu = Renderer::new(r.config);
@@ -115,7 +115,7 @@ fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, grads: &ImageGrads<'_, f32>, wh
     let cpu: &dyn Backend = &cpu;
     let radii = Backend::radii(r).iter().zip(cpu.radii());
     let otherwise = radii.filter(|(a, b)| (**a - **b).abs() > 2e-3 * b.abs().max(1.0)).count();
-    // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles.
+    // The CPU tests ellipses against bins, the GPU against tiles.
     assert!(otherwise <= 2 + d.mean2d.len() / 100, "{what}: {otherwise} radii are others");
     println!("{what}: worst relative difference {worst:.1e}");
     worst
@@ -189,7 +189,7 @@ fn records_of(
             let at = y * w + x;
             let plane = |p: &Planes<f32>, c: usize| f64::from(p.plane(c)[at]);
             let g = [0, 1, 2, 3].map(|c| if c < 3 { plane(&pulled.0[0], c) } else { plane(&pulled.0[2], 0) });
-            // Weights first, so that what is still to come is known exactly.
+            // Weights first, so that the remaining light is known exactly.
             let (mut t, mut seen) = (1.0, Vec::new());
             for (i, &(_, owner)) in list.iter().enumerate() {
                 let splat = (owner & 0x0fff_ffff) as usize;
@@ -344,14 +344,14 @@ fn the_backward_pass_repeats_bit_for_bit_in_bands() {
     };
     assert!(first.background == second.background && all(&first, &first_sh) == all(&second, &second_sh));
     assert!(r.timings().back_total > 0.0 && r.timings().back_wait > 0.0);
-    // Less room than one image's pairs: bands, whose records are made one after the other.
+    // Smaller buffers than one image's pairs: bands, whose records are made one after the other.
     r.most_pairs = pairs / 3;
     (r.buffers, r.groups) = (Buffers::new(), None);
     let (_, bands, bands_sh) = back(&mut r, &shot, &pulled.all());
     assert!(r.stats().bands > 2 && r.stats().pairs == pairs);
     assert!(all(&first, &first_sh) == all(&bands, &bands_sh), "bands change no bit");
     assert!(first.background == bands.background);
-    // Little room at first, which must overflow, and more.
+    // Small buffers at first, which must overflow, then larger ones.
     (r.most_pairs, r.buffers, r.groups) = (MOST_PAIRS, Buffers::new(), None);
     r.make_room_for_pairs(1000).expect("a little room");
     let (_, grown, grown_sh) = back(&mut r, &shot, &pulled.all());
@@ -395,7 +395,7 @@ fn small_bindings_cut_tables_and_images_and_change_no_bit() {
         }
         compare(&mut poor, &shot, &pulled.all(), what);
     }
-    // What no page can hold is an error: here a row of tiles.
+    // Pairs that no page can hold are an error: here a row of tiles.
     let wide = Camera { width: 6000, ..camera };
     let splats = scene.splats();
     let error = poor.render(&shot(&splats, &wide), &mut Image::default()).expect_err("it is too wide");
@@ -416,7 +416,7 @@ fn a_device_that_is_lost_is_an_error_and_not_a_panic() {
 }
 
 #[test]
-fn a_gradient_that_is_no_number_is_an_error_and_the_next_is_not() {
+fn a_non_finite_gradient_is_an_error_and_the_next_is_not() {
     let Some(mut r) = renderer() else { return };
     let (scene, camera) = (Scenery::new(60, 300, 1.0, 0.1), camera([0.0, 0.5, -4.0], 40, 30));
     let (splats, mut pulled) = (scene.splats(), Pulled::new(61, &camera));

@@ -1,4 +1,4 @@
-//! Comparing on the GPU: value and gradient against the definition in f64, then all of it against the way through the CPU.
+//! Comparing on the GPU: value and gradient against the definition in f64, then the whole against the CPU.
 
 use super::*;
 use crate::render::{Comparison, PartGrads, Target};
@@ -32,7 +32,7 @@ fn truth(seed: u64, camera: &Camera, eight: bool) -> (Planes<f32>, Planes<f32>) 
     (color, weight)
 }
 
-/// The definition: value and gradient to the drawn image and to the response, every window summed up where it is
+/// The definition: value and gradient to the rendered image and to the response, every window summed up where it is
 /// needed.
 fn defined(drawn: &Planes<f32>, target: &Target<'_>) -> (Comparison, Vec<f64>) {
     let (h, w) = (drawn.height as i64, drawn.width as i64);
@@ -118,7 +118,7 @@ fn compared(r: &mut GpuRenderer, shot: &Shot<'_>, target: &Target<'_>) -> (Compa
 }
 
 #[test]
-fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
+fn value_and_gradient_equal_the_definition_and_the_cpu() {
     let Some(mut r) = renderer() else { return };
     let scene = Scenery::new(80, 400, 1.2, 0.08);
     let cameras = [camera([0.0, 0.5, -4.0], 67, 45), skewed(16, 33), camera([0.2, 0.1, -0.8], 5, 3)];
@@ -140,7 +140,7 @@ fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
             let what = format!("camera {i}, {weighted}, {response:?}, {eight}");
             let (got, d, d_sh) = compared(&mut r, &shot, &target);
             let d_picture: Vec<f32> = read(&r.gpu, &r.buffers.d_planes, 3 * truth.pixels());
-            // The same through the CPU: the image comes down, its gradient goes up.
+            // The same through the CPU: the image is downloaded, its gradient uploaded.
             let mut image = Image::default();
             r.render(&shot, &mut image).expect("it is drawn");
             let (expected, d_expected) = defined(&image.color, &target);
@@ -184,11 +184,11 @@ fn comparison_repeats_bit_for_bit_at_any_budget_and_images_are_uploaded_once() {
     };
     let first = bits(compared(&mut r, &shot, &target(0)));
     assert!(first == bits(compared(&mut r, &shot, &target(0))) && r.pictures.sent == 1, "the same, sent once");
-    // Little room at first, which must overflow.
+    // Small buffers at first, which must overflow.
     (r.buffers, r.groups) = (Buffers::new(), None);
     r.make_room_for_pairs(1000).expect("a little room");
     assert!(first == bits(compared(&mut r, &shot, &target(0))), "room changes no bit");
-    // A budget that holds two images: the third is sent whenever it is wanted.
+    // A budget that holds two images: the third is sent whenever it is needed.
     let one = r.pictures.bytes();
     r.pictures.budget = 2 * one;
     for picture in [1, 2, 0, 1, 2] {

@@ -3,8 +3,8 @@
 use super::*;
 use crate::render::RenderStats;
 
-/// Largest difference of a colour or an alpha. A splat at the α cut-off may be drawn on one side only, which is 1/255
-/// of what is left of the light there.
+/// Largest difference of a colour or an alpha. A splat at the α cut-off may be rendered on one side only, which is
+/// 1/255 of what is left of the light there.
 const PIXEL: f32 = 2e-3;
 /// Largest difference of Σ z α T, of the scene's depth.
 const DEPTH: f32 = 2e-3;
@@ -21,7 +21,7 @@ fn psnr(a: &[f32], b: &[f32]) -> f64 {
     -10.0 * (sum / a.len() as f64).log10()
 }
 
-/// Asserts that both draw the same, and returns the PSNR.
+/// Asserts equal renders, and returns the PSNR.
 fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, what: &str) -> (f64, RenderStats) {
     let mut image = Image::default();
     r.render(shot, &mut image).expect("it is drawn");
@@ -168,7 +168,7 @@ fn bands_make_the_same_image() {
     r.render(&shot(&scene.splats(), &camera), &mut whole).expect("it is drawn");
     let (pairs, one) = (r.stats().pairs, r.stats().bands);
     assert!(one == 1 && pairs > 1 << 16, "{pairs} pairs must be more than there was room for at first");
-    // A renderer without memory yet, so that there is little room.
+    // A renderer without memory yet, so that its buffers are small.
     let Some(mut r) = own_renderer() else { return };
     r.most_pairs = pairs / 4;
     r.render(&shot(&scene.splats(), &camera), &mut bands).expect("it is drawn");

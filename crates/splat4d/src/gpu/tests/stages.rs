@@ -134,7 +134,7 @@ fn sorted(gpu: &Gpu, kernel: &Kernel, keys: &[u32], values: &[u32], passes: u32)
     (read(gpu, &keys[last], n), read(gpu, &values[last], n))
 }
 
-/// The sort with subgroups of so many threads on any device: votes go through the workgroup's memory.
+/// The sort with emulated subgroups of this many threads on any device: votes use the workgroup's memory.
 fn as_if_subgroups_had(size: u32) -> String {
     let stand_in = "
         var<private> stand_in_thread: u32;
@@ -259,7 +259,7 @@ fn sums_are_exclusive_and_stop_at_the_top() {
     }
 }
 
-/// `count` and `emit` may disagree by a rounding: here every splat is said to have a tile more than `emit` finds.
+/// `count` and `emit` may disagree by a rounding: here every splat claims one tile more than `emit` finds.
 #[test]
 fn a_pair_without_a_tile_is_in_no_list() {
     let Some(mut r) = renderer() else { return };

@@ -1,4 +1,4 @@
-//! Which questions are one, and that the way there and back is that of the motion models.
+//! Which queries are merged, and that forward and backward equal those of the motion models.
 
 use super::*;
 use crate::math::Rng;
@@ -36,7 +36,7 @@ fn layer(spec: &Spec, life: LifeKind, seed: u64) -> Layer<f64> {
     Layer::new("made", params, motion, life)
 }
 
-/// One layer with lives, and one whose motion model prepares and finishes.
+/// One layer with lifespans, and one whose motion model prepares and finishes.
 fn layers() -> Vec<Layer<f64>> {
     let skin = SkinSpec { nodes: 5, neighbours: 3, hyper: 2, mask: false };
     let trajectory = TrajectorySpec::Keys { curve: Curve::Cubic, keys: 4 };
@@ -54,7 +54,7 @@ fn ids(rows: Rows<'_>) -> Option<Vec<u32>> {
 }
 
 #[test]
-fn equal_questions_are_one_and_rows_are_united() {
+fn equal_queries_are_merged_with_their_rows() {
     let mut e = Evaluation::<f64>::default();
     let t = Time(0.3);
     assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[1, 4, 9]), t), 0);
@@ -81,7 +81,7 @@ fn active_rows_are_merged_with_requested_rows() {
     assert!(!layer.active(t, &mut alive) && !alive.is_empty() && alive.len() < ROWS);
     let dead = (0..ROWS as u32).find(|id| !alive.contains(id)).unwrap();
     let mut e = Evaluation::default();
-    e.ask_active(0, layer, t);
+    e.request_active(0, layer, t);
     assert_eq!(ids(e.tape(0).rows()), Some(alive.clone()));
     let mut both = alive;
     both.push(dead);
@@ -93,7 +93,7 @@ fn active_rows_are_merged_with_requested_rows() {
         if asks_first {
             ask(&mut e);
         }
-        assert_eq!(e.ask_active(0, layer, t), 0);
+        assert_eq!(e.request_active(0, layer, t), 0);
         if !asks_first {
             ask(&mut e);
         }
@@ -101,7 +101,7 @@ fn active_rows_are_merged_with_requested_rows() {
     }
 }
 
-/// The questions of the tests below: a layer, its rows, a time.
+/// The queries of the tests below: a layer, its rows, a time.
 const ASKED: [(usize, Option<&[u32]>, f64); 4] =
     [(0, Some(&[1, 4, 17]), 0.3), (1, None, 0.3), (0, Some(&[4, 5]), 0.7), (1, Some(&[0, 9]), 0.6)];
 
@@ -114,7 +114,7 @@ fn evaluation(layers: &[Layer<f64>]) -> Evaluation<f64> {
     e
 }
 
-/// dL/d out of question i, row j, column c; L is linear in all answers.
+/// dL/d out of query i, row j, column c; L is linear in all results.
 fn weight(i: usize, j: usize, c: usize) -> f64 {
     0.3 + 0.17 * j as f64 - 0.21 * c as f64 + 0.05 * (c * c) as f64 + 0.4 * i as f64
 }
@@ -136,7 +136,7 @@ fn d_outs(e: &Evaluation<f64>) -> Vec<Table<f64>> {
     e.tapes().enumerate().map(table).collect()
 }
 
-/// Gradients of the layers, and dL/dt by question.
+/// Gradients of the layers, and dL/dt by query.
 fn gradients(layers: &[Layer<f64>]) -> (Vec<Grads<f64>>, Vec<f64>) {
     let mut e = evaluation(layers);
     let mut d: Vec<Grads<f64>> = layers.iter().map(|l| Grads::new(&l.params)).collect();
@@ -153,7 +153,7 @@ fn gradients(layers: &[Layer<f64>]) -> (Vec<Grads<f64>>, Vec<f64>) {
         }
     }
     e.backward(layers, &mut d);
-    let times = e.questions.iter().map(|q| q.d_time).collect();
+    let times = e.queries.iter().map(|q| q.d_time).collect();
     (d, times)
 }
 
@@ -173,15 +173,15 @@ fn the_backward_pass_equals_the_motion_model_bit_for_bit() {
             tape.request(Space::Gaussians, ASKED[i].1.map_or(Rows::All, Rows::Some), Time(ASKED[i].2));
         }
         let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(&layer.params));
-        let questions: Vec<At<'_, f64>> = tapes.iter().map(|t| t.question(&layer.params)).collect();
-        layer.motion.prepare(&layer.params, &questions, &mut cache);
+        let queries: Vec<At<'_, f64>> = tapes.iter().map(|t| t.query(&layer.params)).collect();
+        layer.motion.prepare(&layer.params, &queries, &mut cache);
         for (tape, &i) in tapes.iter_mut().zip(&mine) {
             layer.at(&cache, tape);
             let d_out = SplatGrads { out: &d_outs[i], color: None, weights: None };
             assert_eq!(got_times[i], layer.backward(&cache, tape, &d_out, &mut d_cache, &mut d));
         }
-        let questions: Vec<At<'_, f64>> = tapes.iter().map(|t| t.question(&layer.params)).collect();
-        layer.motion.finish(&layer.params, &questions, &mut cache, &mut d_cache, &mut d);
+        let queries: Vec<At<'_, f64>> = tapes.iter().map(|t| t.query(&layer.params)).collect();
+        layer.motion.finish(&layer.params, &queries, &mut cache, &mut d_cache, &mut d);
         assert_eq!(bits(&got[index], &layer.params), bits(&d, &layer.params), "layer {index}");
     }
 }

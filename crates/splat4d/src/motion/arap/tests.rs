@@ -56,7 +56,7 @@ fn energy_never_rises_and_handles_stay_at_their_targets() {
 }
 
 #[test]
-fn what_is_not_tied_to_a_handle_stays() {
+fn untied_gaussians_stay() {
     let mut rest = rod(80, [0.0; 3], 3);
     rest.extend(rod(80, [0.0, 3.0, 0.0], 4));
     let handles = [0, 40, 79].map(|k| Handle {
@@ -71,7 +71,7 @@ fn what_is_not_tied_to_a_handle_stays() {
 }
 
 #[test]
-fn odd_questions_have_answers() {
+fn odd_queries_have_results() {
     assert!(drag(&[], &[], 3).unwrap().positions.is_empty());
     let one = Handle { node: 0, target: [1.0, 2.0, 3.0], rotation: None };
     assert_eq!(drag(&[[0.0; 3]], &[one], 3).unwrap().positions, [[1.0, 2.0, 3.0]]);

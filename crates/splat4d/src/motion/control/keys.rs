@@ -16,7 +16,7 @@ const REACH: usize = 4;
 /// Below this 1 − cos θ, θ/sin θ is taken from its series, whose next term is then below 1e-12.
 const SMALL_TURN: f64 = 1e-6;
 
-/// Where keys stand in time.
+/// Times of keys.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Timeline {
     curve: Curve,
@@ -38,10 +38,10 @@ impl Timeline {
     pub(crate) fn new(curve: Curve, keys: usize, clip: [f64; 2]) -> Result<Self> {
         let least = if curve == Curve::Cubic { REACH } else { 2 };
         if !(least..=MAX_KEYS).contains(&keys) {
-            return Err(refuse(format!("a curve of {keys} keys cannot be: {least} to {MAX_KEYS} are possible")));
+            return Err(refuse(format!("invalid curve of {keys} keys: expected {least} to {MAX_KEYS}")));
         }
         if !(clip[0].is_finite() && clip[1].is_finite() && clip[0] <= clip[1]) {
-            return Err(refuse(format!("a clip from {} to {} seconds cannot be", clip[0], clip[1])));
+            return Err(refuse(format!("invalid clip from {} to {} seconds", clip[0], clip[1])));
         }
         Ok(Self { curve, keys, clip })
     }
@@ -92,8 +92,8 @@ fn cubic_slope(u: f64) -> [f64; REACH] {
     [-v * v, 3.0 * u2 - 4.0 * u, -3.0 * u2 + 2.0 * u + 1.0, u2].map(|x| 0.5 * x)
 }
 
-/// A trajectory of keys: table `node_keys` with `node_shifts` [nodes, 3·keys] and `node_turns` [nodes, 4·keys], key after
-/// key.
+/// A trajectory of keys: table `node_keys` with `node_shifts` [nodes, 3·keys] and `node_turns` [nodes, 4·keys], key
+/// after key.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keys {
     line: Timeline,

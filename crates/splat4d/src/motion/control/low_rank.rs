@@ -1,4 +1,5 @@
-//! Few motions that all nodes share: pose_k(t) = Σ_b c_kb f_b(t), with f_b a cubic curve and c_kb seven numbers a node.
+//! Few motions that all nodes share: pose_k(t) = Σ_b c_kb f_b(t), with f_b a cubic curve and c_kb seven numbers per
+//! node.
 //!
 //! Source: Kratimenos et al. 2024 ("DynMF"), there with a network for f and a coefficient a Gaussian; nodes carry them
 //! here, so that Gaussians still follow rigidly.
@@ -11,8 +12,8 @@ use crate::motion::Slot;
 use crate::scene::{Grads, Key, Params, Space, Table, Time};
 use std::f64::consts::PI;
 
-/// A trajectory of shared motions: `bases` [bases·keys, 1] (global); a table with `shift_coefficients` [nodes, 3·bases] and
-/// `turn_coefficients` [nodes, 4·bases].
+/// A trajectory of shared motions: `bases` [bases·keys, 1] (global); a table with `shift_coefficients` [nodes, 3·bases]
+/// and `turn_coefficients` [nodes, 4·bases].
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LowRank {
     line: Timeline,
@@ -27,7 +28,7 @@ impl LowRank {
     /// Errors: too many bases, tables that would be too large, loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(line: Timeline, count: usize, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
         if !(1..=MAX_BASES).contains(&count) {
-            return Err(refuse(format!("{count} shared motions cannot be: 1 to {MAX_BASES} are possible")));
+            return Err(refuse(format!("invalid number of shared motions {count}: expected 1 to {MAX_BASES}")));
         }
         let (rows, width, keys) = (skin.count(p), POSE * count, line.keys());
         check_size("node_coefficients", rows, width)?;

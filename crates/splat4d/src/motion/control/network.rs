@@ -1,8 +1,8 @@
 //! A perceptron of a node's rest position and of time: nearby nodes and nearby times move alike by themselves.
 //!
-//! pose_k(t) = MLP(γ(p̃_k), γ(τ)), p̃ the position in units of the nodes' extent at the start, τ the share of the clip. The
-//! last layer starts at zero: at rest. Source: Huang et al. 2024 (SC-GS): 8 layers of 256 with the input again in the
-//! middle; smaller ones learn in minutes.
+//! pose_k(t) = MLP(γ(p̃_k), γ(τ)), p̃ the position in units of the nodes' extent at the start, τ the share of the clip.
+//! The last layer starts at zero: at rest. Source: Huang et al. 2024 (SC-GS): 8 layers of 256 with the input again in
+//! the middle; smaller ones learn in minutes.
 
 use super::super::skin::{POSE, Skin, Trajectory};
 use super::refuse;
@@ -13,8 +13,8 @@ use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
 use crate::nn::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use crate::scene::{Grads, Key, Params, Space, Table, Time};
 
-/// From so many hidden layers on the input comes in again in the middle (Mildenhall et al. 2020: after the fourth of
-/// eight).
+/// From this many hidden layers on the input is appended again in the middle (Mildenhall et al. 2020: after the fourth
+/// of eight).
 const DEEP: usize = 6;
 
 /// Shape of the network.
@@ -28,8 +28,8 @@ pub(crate) struct NetworkShape {
     pub levels: [usize; 2],
 }
 
-/// A trajectory that a perceptron gives: tables `trajectory.*`, and `node_units` [4, 1] (centre and 1/extent of the nodes at
-/// the start), which is not learnt.
+/// A trajectory that a perceptron gives: tables `trajectory.*`, and `node_units` [4, 1] (centre and 1/extent of the
+/// nodes at the start), which is not learnt.
 #[derive(Clone, Debug)]
 pub(crate) struct Network {
     mlp: Mlp,
@@ -66,7 +66,7 @@ impl Network {
         p: &mut Params<F>,
     ) -> Result<Self> {
         if shape.levels.iter().any(|&l| l > MAX_LEVELS) {
-            return Err(refuse(format!("an encoding of more than {MAX_LEVELS} levels cannot be")));
+            return Err(refuse(format!("invalid encoding: more than {MAX_LEVELS} levels")));
         }
         let units = p.entry("node_units", Space::Fixed, &[("node_units", 1)], 4, |_| {})?;
         p.info_mut(units).trainable = false;
@@ -185,7 +185,7 @@ impl<F: Real> Trajectory<F> for Network {
 }
 
 fn pass_of<F: Real>(cache: &Slot, t: Time) -> &Pass<F> {
-    let passes: &Passes<F> = cache.get().expect("prepare comes before every question");
+    let passes: &Passes<F> = cache.get().expect("`prepare` precedes every query");
     let same = |pass: &&Pass<F>| pass.t.0.to_bits() == t.0.to_bits();
     passes.0.iter().find(same).expect("every time of a step was prepared")
 }

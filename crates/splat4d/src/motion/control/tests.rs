@@ -4,7 +4,7 @@ use crate::scene::Time;
 #[test]
 fn cubic_curves_are_smooth_and_reproduce_straight_lines() {
     let line = Timeline::new(Curve::Cubic, 9, [2.0, 5.0]).unwrap();
-    // Keys of a straight line stand where the line is one segment before the clip and after.
+    // Keys of a straight line extend it by one segment before and after the clip.
     let rate = 6.0 / 3.0;
     let at = |t: f64, keys: &dyn Fn(usize) -> f64| {
         let (first, w, slopes) = line.weights(Time(t));

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 pub(crate) const GEOMETRY_WIDTH: usize = 11;
 /// Outputs a Gaussian of a network without screws: δx 3, δq 4, δs 3.
 pub(crate) const HEADS: usize = 10;
-/// Numbers a row of the gradient: to the geometry, then to the heads (with a screw: 13).
+/// Numbers per row of the gradient: to the geometry, then to the heads (with a screw: 13).
 const D_ROW: usize = GEOMETRY_WIDTH + HEADS + 3;
 /// Scales never fall below this, scene units: what is added after the activation may be negative.
 const MIN_SCALE: f64 = 1e-6;
@@ -157,7 +157,7 @@ impl<F: Real> Bounds<F> {
     }
 }
 
-/// Splats of an answer.
+/// Splats of a result.
 pub(crate) struct Written<'a, F> {
     /// The layer's.
     pub geometry: &'a Table<F>,
@@ -185,7 +185,7 @@ impl<F: Real> Work<F, 1> for Written<'_, F> {
     }
 }
 
-/// Gradients of an answer's rows, [rows, [`D_ROW`]].
+/// Gradients of a result's rows, [rows, [`D_ROW`]].
 pub(crate) struct Gradient<'a, F> {
     /// The layer's.
     pub geometry: &'a Table<F>,

@@ -126,7 +126,7 @@ fn outside_the_clip_it_is_as_at_its_ends() {
 }
 
 #[test]
-fn moving_the_scene_moves_the_answer() {
+fn moving_the_scene_moves_the_result() {
     for spec in every() {
         let shift = [4.0, -2.0, 8.0];
         let (mut a, mut b) = (cloud::<f64>(30, [0.0; 3]), cloud::<f64>(30, shift));

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// c ↦ curve(M c + o), channel by channel in the curve; colours are 0 to 1.
 ///
-/// On spherical harmonics the base colour goes through it and all that varies with direction through its slope there: exact
+/// On spherical harmonics the base colour is mapped by it, and all that varies with direction by its slope there: exact
 /// where there is no curve.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -15,8 +15,8 @@ pub struct ColorMap {
     pub matrix: [[f64; 3]; 3],
     /// o
     pub offset: [f64; 3],
-    /// Corners [in, out] of a broken line, `in` rising; beyond the first and the last it goes on as it did. Fewer than two:
-    /// no curve.
+    /// Corners [in, out] of a broken line, `in` rising; beyond the first and the last it continues as it did. Fewer
+    /// than two: no curve.
     pub curve: Vec<[f64; 2]>,
 }
 
@@ -56,7 +56,7 @@ impl ColorMap {
         (bent.map(|b| b.0), bent.map(|b| b.1))
     }
 
-    /// Colours, three channels; more are left as they are.
+    /// Colours, three channels; further ones are not changed.
     pub(super) fn colors<F: Real>(&self, row: &mut [F]) {
         let rgb = self.colored(std::array::from_fn(|c| row[c].f64())).0;
         (0..3).for_each(|c| row[c] = F::of(rgb[c]));

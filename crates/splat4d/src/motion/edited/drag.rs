@@ -13,9 +13,9 @@ const NODE: usize = 10;
 
 /// A drag as plain data; its numbers are tables.
 ///
-/// `drag_nodes.INDEX` holds place p, shift T and turn R of every node at every key time, along broken lines between them.
-/// `drag_pulls@INDEX` holds for every Gaussian K node numbers and K weights a_k with Σ a_k ≤ 1; with weights of zero it stays
-/// where the model inside has it. μ' = μ + Σ a_k (R_k (μ − p_k) + p_k + T_k − μ).
+/// `drag_nodes.INDEX` holds place p, shift T and turn R of every node at every key time, along broken lines between
+/// them. `drag_pulls@INDEX` holds for every Gaussian K node numbers and K weights a_k with Σ a_k ≤ 1; with weights of
+/// zero it stays as given by the inner model. μ' = μ + Σ a_k (R_k (μ − p_k) + p_k + T_k − μ).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragSpec {
@@ -47,7 +47,7 @@ pub(crate) type NodeOffset = ([f64; 3], [f64; 3], [f64; 4]);
 /// Numbers of a drag, to be written into its tables.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct NodeOffsets {
-    /// [times, nodes]: place, shift, and the turn as a unit quaternion.
+    /// [times, nodes]: position, shift, and the turn as a unit quaternion.
     pub nodes: Vec<NodeOffset>,
     /// [Gaussians, K]: node and weight.
     pub pulls: Vec<(u32, f32)>,
@@ -128,7 +128,7 @@ impl<'a, F: Real> Pulls<'a, F> {
         Self { nodes: (0..spec.nodes).map(node).collect(), table: &p[keys.pulls] }
     }
 
-    /// Where Gaussian `id` moves; none if it is not dragged.
+    /// Displacement of Gaussian `id`; none if it is not dragged.
     #[inline(always)]
     pub(super) fn of(&self, id: usize) -> Option<Affine<F>> {
         let count = self.table.width() / 2;

@@ -19,7 +19,7 @@ pub struct PathKey {
     pub turn: [f64; 4],
     /// Scene units.
     pub shift: [f64; 3],
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
@@ -59,13 +59,13 @@ pub struct FadeKey {
     pub t: f64,
     /// 0 to 1.
     pub factor: f64,
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
 
-/// How far something is on its way at the share u of its time: evenly, or slowly at the ends that ease (Hermite's cubic with
-/// slope 0 there and 1 elsewhere).
+/// How far something is on its way at the share u of its time: evenly, or slowly at the ends that ease (Hermite's cubic
+/// with slope 0 there and 1 elsewhere).
 pub(crate) fn eased(u: f64, ease: [bool; 2]) -> f64 {
     if ease == [false; 2] {
         return u;

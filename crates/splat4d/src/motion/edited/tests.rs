@@ -32,7 +32,7 @@ fn a_path_passes_its_keys_and_turns_shapes() {
         // The long axis was x and is y.
         assert!((there.get(row, COV + 3) - (-4.0f64).exp()).abs() < 1e-12);
     }
-    // Half way in time is half way of the angle, about the place that it turns about.
+    // Half way in time is half way of the angle, about the position that it turns about.
     let about = [0.1, -0.2, 0.3];
     let half = at(Change::Path { about, keys }, None, 1.0).read::<3>(10, 0);
     let angle = |x: [f64; 3]| (x[1] - about[1]).atan2(x[0] - about[0]);
@@ -66,7 +66,7 @@ fn rigidly_moving_nodes_move_their_gaussians_alone() {
 }
 
 #[test]
-fn what_cannot_be_is_refused() {
+fn invalid_changes_are_refused() {
     let mut p = Params::<f32>::new(2, 1, &[]);
     let key = |t| PathKey { t, ..PathKey::default() };
     for (change, word) in [

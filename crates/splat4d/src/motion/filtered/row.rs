@@ -53,11 +53,12 @@ impl Normal {
     }
 }
 
-/// How a Gaussian is taken to go on. Means go on at constant velocity in all of them.
+/// How a Gaussian is taken to continue. Means continue at constant velocity in all of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Predictor {
-    /// The six numbers of the covariance go on in a straight line; what leaves the space of covariances is lifted back.
+    /// The six numbers of the covariance continue in a straight line; what leaves the space of covariances is lifted
+    /// back.
     Euclidean,
     /// At constant velocity in Wasserstein geometry: Exp(−Log).
     #[default]
@@ -140,8 +141,8 @@ pub enum Fusion {
     /// Not at all: the observation is the state, and the filter costs nothing.
     #[default]
     Off,
-    /// Between the two by one learnt share a Gaussian: means in a straight line, shapes on the geodesic. No splat becomes
-    /// thinner by being certain.
+    /// Between the two by one learnt share a Gaussian: means in a straight line, shapes on the geodesic. No splat
+    /// becomes thinner by being certain.
     Geodesic,
     /// Kalman's formulas with the covariances as uncertainties, as published: shapes shrink (to half where both agree).
     Literal,
@@ -200,7 +201,8 @@ pub(crate) struct FusedGrads {
 
 impl Fused {
     /// `gain`: share of the observation in [0, 1] (geodesic); `trust`: how far predictions count, in [0, 1]; `gate`:
-    /// squared Mahalanobis distance at which nothing of the prediction is left (it fades from half of that); 0: no gate.
+    /// squared Mahalanobis distance at which nothing of the prediction is left (it fades from half of that); 0: no
+    /// gate.
     pub(crate) fn new(fusion: Fusion, seen: &Normal, predicted: &Normal, gain: f64, trust: f64, gate: f64) -> Self {
         let delta: [f64; 3] = std::array::from_fn(|k| seen.mean[k] - predicted.mean[k]);
         let sum = mix(1.0, &seen.cov, 1.0, &predicted.cov);
@@ -226,7 +228,7 @@ impl Fused {
                 let k = mul(&predicted.cov, &precision);
                 let step = apply(&predicted.cov, weighed);
                 let mean = std::array::from_fn(|i| predicted.mean[i] + step[i]);
-                // (I − K)Σₚ = Σₚ − Σₚ S⁻¹ Σₚ is symmetric by itself.
+                // (I − K)Σₚ = Σₚ − Σₚ S⁻¹ Σₚ is already symmetric.
                 let cov = mix(1.0, &predicted.cov, -1.0, &sandwich(&predicted.cov, &precision));
                 let state = Normal { mean, cov };
                 out.point = Normal {

@@ -43,7 +43,7 @@ fn constant_velocity_is_predicted_exactly() {
             assert_near(&p.cov, &shape.cov, 1e-12);
         }
     }
-    // A ball that grows steadily: standard deviations go on in a straight line along the geodesic, variances do not.
+    // A ball that grows steadily: standard deviations continue in a straight line along the geodesic, variances do not.
     let grown = |t: f64| ball([0.0; 3], 1.0 + 0.3 * t);
     let truth = grown(2.0);
     let curved = Prediction::new(Predictor::Wasserstein, &grown(1.0), &grown(0.0), 1).point;
@@ -60,7 +60,7 @@ fn kalman_halves_the_variance_of_agreeing_values_and_keeps_certain_ones() {
     let merged = Fused::new(Fusion::Literal, &seen, &predicted, 0.3, 1.0, 0.0).point;
     assert!((merged.mean[0] - 0.5).abs() < 1e-9);
     assert_near(&merged.cov, &ball([0.0; 3], 0.2 * 0.5f64.sqrt()).cov, 1e-9);
-    // The sign that goes wrong elsewhere, Σ + KΣ, would leave more doubt than there was.
+    // The sign that is wrong elsewhere, Σ + KΣ, would leave more doubt than there was.
     let wrong = mix(1.5, &predicted.cov, 0.0, &predicted.cov);
     assert!(merged.cov[0][0] < predicted.cov[0][0] && wrong[0][0] > predicted.cov[0][0]);
     let vague = ball([9.0, 0.0, 0.0], 1e4);
@@ -85,7 +85,7 @@ fn geodesic_fusion_returns_its_ends_exactly_and_rejects_jumps() {
     assert_near(&at(0.0).cov, &predicted.cov, 1e-10);
     let same = Fused::new(Fusion::Geodesic, &seen, &seen, 0.3, 1.0, 0.0).point;
     assert_eq!(same.cov, seen.cov, "where both agree nothing changes");
-    // A jump: the innovation is beyond what chance explains, and the observation stands.
+    // A jump: the innovation is beyond what chance explains, and the observation counts.
     let far = Normal { mean: predicted.mean.map(|x| x + 40.0), ..seen };
     for fusion in [Fusion::Geodesic, Fusion::Literal] {
         let state = Fused::new(fusion, &far, &predicted, 0.3, 1.0, GATE);
@@ -237,7 +237,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
     let short = followed(seen, |s| s.gain = 5.0 / 6.0);
     assert!(rmse(&short, &truth) < 0.98 * raw, "{} of {raw}", rmse(&short, &truth));
 
-    // At rest, then gone at once by many times its size a frame.
+    // At rest, then a sudden motion of many times its size per frame.
     let onset: Vec<[f64; 3]> = (0..40).map(|i| [if i < 20 { 0.0 } else { 9.0 * (i - 19) as f64 }, 0.0, 0.0]).collect();
     let reset = followed(onset.clone(), |s| (s.history, s.gain) = (8, 0.2));
     assert!((0..40).all(|i| reset[i] == onset[i] || (reset[i][0] - onset[i][0]).abs() < 1e-9), "{reset:?}");
@@ -311,7 +311,7 @@ fn with_the_gradient_stopped_only_the_observation_learns() {
     let stopped = of(around.clone());
     let gains = filled::<f64>(&Spec::Filtered(around), 9).0.find(GAINS).unwrap();
     for j in 0..9 {
-        // μ = κμₒ + (1−κ)(2μ₁−μ₂): all of it is one to the canonical mean, κ alone where earlier answers are constants.
+        // μ = κμₒ + (1−κ)(2μ₁−μ₂): all of it is one to the canonical mean, κ alone where earlier results are constants.
         assert!((whole.table(GEOMETRY).get(j, 0) - 1.0).abs() < 1e-9);
         let kept = stopped.table(GEOMETRY).get(j, 0);
         assert!(kept > 0.2 && kept < 0.9, "{kept}");
@@ -415,7 +415,7 @@ fn models() -> Vec<Spec> {
     all
 }
 
-/// Answers, colours, gradients and velocities of a step with two questions.
+/// Results, colours, gradients and velocities of a step with two queries.
 fn whole(p: &Params<f64>, model: &dyn Motion<f64>, rows: Rows<'_>) -> Vec<f64> {
     let q = [0.21, 0.77].map(|t| At { p, of: Space::Gaussians, rows, t: Time(t) });
     let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(p));

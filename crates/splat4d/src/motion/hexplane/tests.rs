@@ -66,7 +66,7 @@ fn the_coarse_stage_is_static_and_trains_no_plane() {
     assert_ne!(splats(&p, &model, 3.0), splats(&p, &Still, 3.0));
 }
 
-/// A finished scene's file states nothing of phases; files from before said both numbers always.
+/// A finished scene's file does not state phases; earlier files always stated both numbers.
 #[test]
 fn files_hold_a_phase_only_while_training_is_not_over() {
     let (_, model) = cloud::<f64>(spec(), 20);
@@ -102,7 +102,7 @@ fn every_head_can_be_left_out() {
     }
 }
 
-/// The splats depend on where they are as the original's do: the box is what the planes are stretched over.
+/// The splats depend on their positions as in the original: the planes cover the box.
 #[test]
 fn cloud_and_box_moved_together_deform_alike() {
     let (p, model) = cloud::<f64>(spec(), 30);
@@ -135,7 +135,7 @@ fn more_rows_than_are_kept_are_the_same_rows() {
     let (all, some) = (splats(&p, &model, 3.3), splats(&tail, &model, 3.3));
     for j in 0..80 {
         let (a, b) = (all.read::<10>(ROWS - 10 + j, 0), some.read::<10>(j, 0));
-        // Matrix products round a row by where it stands in its chunk.
+        // Matrix products round a row by where it is in its chunk.
         assert!((0..10).all(|c| (a[c] - b[c]).abs() <= 1e-5 * a[c].abs().max(1.0)), "{a:?} {b:?}");
     }
     let (all, some) = (gradient(&p, &model, 3.3), gradient(&tail, &model, 3.3));

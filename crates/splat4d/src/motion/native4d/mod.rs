@@ -34,9 +34,10 @@ pub const MAX_HARMONICS: usize = 2;
 pub(crate) const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_scales", 1), ("right_quats", 4)];
 /// Its name.
 pub const TABLE: &str = "native4d";
-/// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
+/// The parts of a split have lifespans shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024
+/// all four.
 const SPLIT_SHRINK: f64 = 1.6;
-/// The shortest life that numbers can stand, seconds.
+/// The shortest lifespan within the number range, seconds.
 pub(crate) const SHORTEST: f64 = 1e-6;
 /// The longest: a day.
 pub(crate) const LONGEST: f64 = 86_400.0;
@@ -49,7 +50,7 @@ const FASTEST: f64 = 1e9;
 pub struct Native4dSpec {
     /// κ: how many scene units are as far as a second. Rotations mix space with κt, so that a velocity of κ is 45°.
     pub speed: f64,
-    /// No Gaussian's life has a smaller standard deviation than this, seconds.
+    /// No Gaussian's lifespan has a smaller standard deviation than this, seconds.
     pub min_life: f64,
     /// No scale in time counts as more than this, seconds.
     pub max_life: f64,
@@ -57,7 +58,7 @@ pub struct Native4dSpec {
     pub harmonics: usize,
     /// T of those blocks, seconds.
     pub period: f64,
-    /// Whether the parts of a split also are apart in time, along the parent's path, and live shorter.
+    /// Whether the parts of a split also are apart in time, along the parent's path, and have shorter lifespans.
     pub split_time: bool,
 }
 
@@ -107,8 +108,8 @@ impl Model for Native4dSpec {
     }
 }
 
-/// Gives a Gaussian, which may move, another velocity at the middle of its life, scene units a second: its slice there and
-/// its life stay. Panics: the model has not made its table.
+/// Gives a Gaussian, which may move, another velocity at the middle of its lifespan, scene units per second: its slice
+/// there and its lifespan stay. Panics: the model has not made its table.
 pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, velocity: [f64; 3]) {
     let own = params.find(TABLE).expect("the model has made its table");
     let slice = Sliced::of(spec, params, own, row);
@@ -116,8 +117,8 @@ pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, v
 }
 
 impl Native4d {
-    /// New Gaussians are static and live for a second around t = 0. With harmonics, the layer's SH table grows by their
-    /// blocks, which start at zero.
+    /// New Gaussians are static and alive for a second around t = 0. With harmonics, the layer's SH table grows by
+    /// their blocks, which start at zero.
     ///
     /// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(spec: Native4dSpec, p: &mut Params<F>) -> Result<Self> {
@@ -137,8 +138,8 @@ impl Native4d {
     }
 }
 
-/// Makes room for `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1, 4,
-/// 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
+/// Allocates `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1, 4, 9
+/// and 16 coefficients are no whole number of blocks of one another, but for one block.
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
     let whole = |width: usize| matches!(width, 3 | 12 | 27 | 48);
@@ -174,8 +175,8 @@ impl<F: Real> Motion<F> for Native4d {
         Spec::Native4d(self.spec)
     }
 
-    /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does. A scale
-    /// has no place, since it would change κ.
+    /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does.
+    /// A scale is not supported, since it would change κ.
     fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         if frame.scale != 1.0 {
             return false;
@@ -232,8 +233,8 @@ impl<F: Real> Motion<F> for Native4d {
         d_time
     }
 
-    /// The parts of a split are apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean goes
-    /// along its path; a split adds what lies across it.
+    /// The parts of a split are apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean
+    /// moves along its path; a split adds what lies across it.
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {
         if edit.space != Space::Gaussians || !self.spec.split_time {
             return;
@@ -250,7 +251,7 @@ impl<F: Real> Motion<F> for Native4d {
         }
     }
 
-    /// The slice grows; velocity and life stay.
+    /// The slice grows; velocity and lifespan stay.
     fn resize(&self, p: &mut Params<F>, row: usize, factor: f64) {
         let mut g = Sliced::of(&self.spec, p, self.own, row);
         g.cov = g.cov.map(|x| x * factor * factor);
@@ -274,7 +275,7 @@ impl<F: Real> Motion<F> for Native4d {
     }
 }
 
-/// One question's parameters, read sixteen rows at a time.
+/// One query's parameters, read sixteen rows at a time.
 struct Reader<'a, F> {
     geometry: &'a Table<F>,
     own: &'a Table<F>,
@@ -402,7 +403,7 @@ impl<F: Real> Work<F, 1> for WavesBackward<'_, F> {
     }
 }
 
-/// Centre and log width of the lives.
+/// Centre and log width of the lifespans.
 struct Life<'a, F> {
     geometry: &'a Table<F>,
     own: &'a Table<F>,

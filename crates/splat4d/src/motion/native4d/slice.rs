@@ -1,9 +1,9 @@
 //! One Gaussian of space and time and its slice at t, with gradients. Generic and branch-free, so that loops over lanes
 //! vectorise.
 //!
-//! Everything here is in the coordinates (x, y, z, κt), κ in scene units a second. A rotation of four dimensions is a
-//! pair of unit quaternions, X ↦ l X r̄ with X = κt + xi + yj + zk. With L = R·diag(s), its last row ℓ, c = ‖ℓ‖² and
-//! v = L₃ℓᵀ, the slice has the mean μ + v·τ/c, τ = κ(t − μ_t), and the covariance L₃(1 − ℓᵀℓ/c)L₃ᵀ. The bracket is a
+//! Everything here is in the coordinates (x, y, z, κt), κ in scene units per second. A rotation of four dimensions is a
+//! pair of unit quaternions, X ↦ l X r̄ with X = κt + xi + yj + zk. With L = R·diag(s), its last row ℓ, c = ‖ℓ‖² and v
+//! = L₃ℓᵀ, the slice has the mean μ + v·τ/c, τ = κ(t − μ_t), and the covariance L₃(1 − ℓᵀℓ/c)L₃ᵀ. The bracket is a
 //! projector, so that the covariance is KKᵀ, K = L₃(1 − ℓᵀℓ/c): no difference of large numbers, never indefinite.
 //! Source: Yang et al. 2024 ("Real-time 4DGS") §4; the projector is our own.
 
@@ -18,13 +18,13 @@ pub(super) const OWN: usize = 6;
 pub(super) const LOG_TIME_SCALE: usize = 1;
 /// First column of the right quaternion.
 pub(super) const RIGHT: usize = 2;
-/// The life's exponent stops at −30: e⁻³⁰ is invisible, and in f32 products with it do not become subnormal.
+/// The lifespan's exponent stops at −30: e⁻³⁰ is invisible, and in f32 products with it do not become subnormal.
 const FAINTEST: f64 = 60.0;
 
 /// Parameters of a slice in addition to the row: see [`super::Native4dSpec`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Frame<F> {
-    /// κ, scene units a second.
+    /// κ, scene units per second.
     pub speed: F,
     /// Least c, scene units².
     pub floor: F,
@@ -100,8 +100,8 @@ pub(super) fn to_products<F: Real>(d: [[F; 4]; 4]) -> [[F; 4]; 4] {
     ]
 }
 
-/// The rotation X ↦ l X r̄ of two unit quaternions (wxyz), rows and columns x, y, z, t. l = r is the rotation of space by
-/// that quaternion.
+/// The rotation X ↦ l X r̄ of two unit quaternions (wxyz), rows and columns x, y, z, t. l = r is the rotation of space
+/// by that quaternion.
 #[inline(always)]
 pub(crate) fn rotation4<F: Real>(l: [F; 4], r: [F; 4]) -> [[F; 4]; 4] {
     from_products(products(l, r))
@@ -209,7 +209,7 @@ fn parts<F: Real>(g: &[F; 11], own: &[F; OWN], t: F, frame: &Frame<F>) -> Parts<
     }
 }
 
-/// The splat at t of a row (geometry 11, own columns 6): mean 3, covariance 6, opacity with the life in it.
+/// The splat at t of a row (geometry 11, own columns 6): mean 3, covariance 6, opacity with the lifespan in it.
 #[inline(always)]
 pub(super) fn slice<F: Real>(g: &[F; 11], own: &[F; OWN], t: F, frame: &Frame<F>) -> [F; 10] {
     let p = parts(g, own, t, frame);
@@ -259,7 +259,7 @@ pub(super) fn slice_backward<F: Real>(
     // h·w, zero where the exponent has stopped.
     let fade = select(p.near, d[SPLAT_OPACITY] * o * life, F::ZERO);
     let d_tau = p.inverse * (dot(d_mean, p.v) - fade * p.tau);
-    // Where c is free, the terms of dL/dc join those of dL/dv: K stands in L's place, and −τ·dτ/c is left along ℓ.
+    // Where c is free, the terms of dL/dc join those of dL/dv: K is in L's place, and −τ·dτ/c is left along ℓ.
     let free = p.c > frame.floor;
     let side: [F; 3] = each(|i| p.inverse * (d_mean[i] * p.tau - two * dot(m[i], p.v)));
     let along = select(free, -p.tau * p.inverse * d_tau, F::ZERO);
@@ -301,7 +301,7 @@ pub(super) fn slice_backward<F: Real>(
     )
 }
 
-/// c of a row, not below the floor: κ² times the variance of its life in seconds.
+/// c of a row, not below the floor: κ² times the variance of its lifespan in seconds.
 #[inline(always)]
 pub(super) fn variance<F: Real>(g: &[F; 11], own: &[F; OWN], frame: &Frame<F>) -> F {
     let [left, right] = quats(g, own).map(|q| quat::normalize(q).0);

@@ -1,5 +1,5 @@
-//! A Gaussian of space and time as its slice: mean, covariance, velocity and life, and the backward pass to scales and
-//! quaternions. In f64, a row at a time: for edits and for conversions.
+//! A Gaussian of space and time as its slice: mean, covariance, velocity and lifespan, and the backward pass to scales
+//! and quaternions. In f64, a row at a time: for edits and for conversions.
 
 use super::Native4dSpec;
 use super::slice::{self, LOG_TIME_SCALE, OWN, RIGHT};
@@ -18,18 +18,18 @@ const SWEEPS: usize = 12;
 pub(crate) struct Sliced {
     /// At `time`.
     pub mean: [f64; 3],
-    /// Scene units a second.
+    /// Scene units per second.
     pub velocity: [f64; 3],
     /// Of the slice.
     pub cov: [f64; 6],
-    /// Middle of the life, seconds.
+    /// Middle of the lifespan, seconds.
     pub time: f64,
-    /// Standard deviation of the life, seconds.
+    /// Standard deviation of the lifespan, seconds.
     pub width: f64,
 }
 
 impl Sliced {
-    /// A row as it is drawn: floors and ceilings applied.
+    /// A row for rendering: lower and upper bounds applied.
     pub(crate) fn of<F: Real>(spec: &Native4dSpec, p: &Params<F>, own: Key, row: usize) -> Self {
         let g = p[GEOMETRY].read::<11>(row, 0).map(Real::f64);
         let o = p[own].read::<OWN>(row, 0).map(Real::f64);
@@ -71,8 +71,9 @@ impl Sliced {
     }
 }
 
-/// Scales and axes (columns, a rotation) of BBᵀ by one-sided Jacobi rotations of B's rows, so that small scales keep their
-/// digits next to large ones (Demmel and Veselić 1992). The last axis is the one closest to t, and points forward.
+/// Scales and axes (columns, a rotation) of BBᵀ by one-sided Jacobi rotations of B's rows, so that small scales keep
+/// their digits next to large ones (Demmel and Veselić 1992). The last axis is the one closest to t, and points
+/// forward.
 fn principal(b: [[f64; 4]; 4]) -> ([f64; 4], [[f64; 4]; 4]) {
     let mut rows = b;
     // Row i of `turns`: which sum of B's rows `rows[i]` is.

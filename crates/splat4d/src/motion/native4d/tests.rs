@@ -72,8 +72,8 @@ fn rotations_are_rotations_and_equal_quaternions_turn_space_alone() {
     }
 }
 
-/// The reference's matrices: M_l M_r with both axes reversed. Its quaternions have x and z swapped and their signs changed,
-/// and, since it turns the conjugate of X, its left one is our right one.
+/// The reference's matrices: M_l M_r with both axes reversed. Its quaternions have x and z swapped and their signs
+/// changed, and, since it turns the conjugate of X, its left one is our right one.
 #[test]
 fn the_reference_writes_the_same_rotation_with_reversed_axes() {
     let m_l = |[a, b, c, d]: [f64; 4]| [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]];
@@ -93,7 +93,7 @@ fn the_reference_writes_the_same_rotation_with_reversed_axes() {
     }
 }
 
-/// The Gaussian of four dimensions as it is defined: mean and covariance.
+/// The four-dimensional Gaussian by its definition: mean and covariance.
 fn whole(g: &[f64; 11], own: &[f64; OWN]) -> ([f64; 4], [[f64; 4]; 4]) {
     let l = quat::normalize([g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]]).0;
     let r = quat::normalize([own[2], own[3], own[4], own[5]]).0;
@@ -214,7 +214,7 @@ fn conversions_agree_at_thirty_times_both_ways() {
             }
         }
     }
-    // A life of STG's is a shorter one of ours; what has no counterpart is refused.
+    // A lifespan of STG's is a shorter one of ours; what has no counterpart is refused.
     let stg = Layer { life: LifeKind::GaussOne, ..kinematic.clone() };
     let same = to_native4d(&stg, SPEC).unwrap();
     let (a, b) = (splats(&stg, 0.3), splats(&same, 0.3));
@@ -352,7 +352,7 @@ fn colours_in_time_have_their_period_are_even_and_join_the_table() {
     let (a, b) = (weights(&l, mean + 0.13), weights(&l, mean - 0.13 + spec.period));
     assert!((0..3).all(|c| (a.get(3, c) - b.get(3, c)).abs() < 1e-12) && a.get(3, 0) == 1.0);
     assert!((a.get(3, 1) - (TAU / 0.8 * 0.13).cos()).abs() < 1e-12);
-    // A file's wide table is claimed as it is; one of no whole number of blocks is refused.
+    // A file's wide table is claimed unchanged; one of no whole number of blocks is refused.
     l.params[SH].set(2, 8, 0.5);
     let table = l.params[SH].clone();
     widen(&mut l.params, 3).unwrap();
@@ -369,7 +369,7 @@ fn colours_in_time_have_their_period_are_even_and_join_the_table() {
 }
 
 #[test]
-fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
+fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_lifespan() {
     let rows = 4000;
     let mut params = Params::<f64>::new(rows, 1, &[]);
     let motion = Native4d::new(SPEC, &mut params).unwrap();
@@ -403,7 +403,7 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
 }
 
 #[test]
-fn far_from_its_life_everything_is_a_number() {
+fn far_from_its_lifespan_everything_is_finite() {
     let l = layer(20, SPEC);
     let single = Layer::new(
         "b",

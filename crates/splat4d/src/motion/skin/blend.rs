@@ -1,8 +1,8 @@
 //! Linear blend skinning of a cloud at one time, and its VJP.
 //!
-//! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit quaternion
-//! (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node only that sums are
-//! made, and all else is done for sixteen Gaussians at a time.
+//! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit
+//! quaternion (4). A Gaussian blends the numbers of its nodes and moves to M x + c with the blend; it is node by node
+//! only that sums are made, and all else is done for sixteen Gaussians at a time.
 
 use super::tasks::{sum_parts, task_rows};
 use super::{POSE, Skin, Weights};
@@ -18,9 +18,9 @@ use rayon::prelude::*;
 
 /// Numbers of a rigid motion.
 const FRAME: usize = 16;
-/// Where c begins.
+/// Offset of c.
 const SHIFT: usize = 9;
-/// Where the quaternion begins.
+/// Offset of the quaternion.
 const TURN: usize = 12;
 
 /// A rigid motion.
@@ -97,8 +97,8 @@ impl<F: Real> Frames<F> {
     }
 }
 
-/// One question about Gaussians.
-pub(super) struct Ask<'a, F> {
+/// One query about Gaussians.
+pub(super) struct SkinQuery<'a, F> {
     pub skin: &'a Skin,
     pub p: &'a Params<F>,
     pub weights: &'a Weights<F>,
@@ -113,7 +113,7 @@ struct Moved<F> {
     /// The nodes' frames, blended, and the signs by which their quaternions were aligned.
     blend: [Lane<F>; FRAME],
     signs: [[F; super::MAX_NEIGHBOURS]; BLOCK],
-    /// How far they would go without a mask.
+    /// Their displacement without a mask.
     away: [Lane<F>; 3],
     /// The quaternions that turn them, and the norms of what those were made from.
     unit: [Lane<F>; 4],
@@ -127,7 +127,7 @@ fn counts<F: Real>(a: F, sign: F) -> Frame<F> {
     each(|i| if i < TURN { a } else { sign * a })
 }
 
-impl<F: Real> Ask<'_, F> {
+impl<F: Real> SkinQuery<'_, F> {
     /// The blend of one Gaussian's nodes, and the signs.
     #[inline(always)]
     fn blend(&self, id: usize) -> (Frame<F>, [F; super::MAX_NEIGHBOURS]) {
@@ -231,7 +231,7 @@ impl<F: Real> Ask<'_, F> {
     }
 }
 
-impl<F: Real> Work<F, 1> for Ask<'_, F> {
+impl<F: Real> Work<F, 1> for SkinQuery<'_, F> {
     #[inline(always)]
     fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
         batch.write(out, 0, &activate_lanes(&self.moved(batch).rows));
@@ -241,7 +241,7 @@ impl<F: Real> Work<F, 1> for Ask<'_, F> {
 
 /// The VJP of one task's rows.
 struct Back<'a, F> {
-    ask: &'a Ask<'a, F>,
+    ask: &'a SkinQuery<'a, F>,
     asked: Rows<'a>,
     d_out: &'a Table<F>,
     /// Of the geometry and of the masks.

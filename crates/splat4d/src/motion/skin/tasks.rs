@@ -5,7 +5,7 @@ use crate::scene::BLOCK;
 
 /// Rows a task takes at least.
 const TASK_ROWS: usize = 1024;
-/// A task's rows a node at least: then adding up all tasks' gradients to nodes is a small part of the work.
+/// A task's rows per node at least: then adding up all tasks' gradients to nodes is a small part of the work.
 const TASK_ROWS_A_NODE: usize = 4;
 
 /// Rows of one task: a function of sizes alone.

@@ -141,7 +141,7 @@ fn one_motion_of_all_nodes_moves_every_gaussian_rigidly() {
     for k in 0..9 {
         let rest = p[skin.nodes].read::<3>(k, 0);
         let shift = se3::sub(body.apply(rest), rest);
-        // Half of them say the same rotation with the other sign.
+        // Half of them are the same rotation with the other sign.
         let s = if k % 2 == 0 { 1.0 } else { -1.0 };
         poses.write(k, 0, [shift[0], shift[1], shift[2], s * q[0] - 1.0, s * q[1], s * q[2], s * q[3]]);
     }

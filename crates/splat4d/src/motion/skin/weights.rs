@@ -1,13 +1,14 @@
 //! Which nodes pull a Gaussian, and how strongly.
 //!
-//! With d² = |x_i − p_k|² + |h_i − h_k|², the kernel of SC-GS is κ_k = exp(−d²/(2 r_k²))·sigmoid(w_k) = exp(−e_k). Only its
-//! ratios matter, so that all are taken relative to the strongest (e_0), and far from every node nothing underflows:
+//! With d² = |x_i − p_k|² + |h_i − h_k|², the kernel of SC-GS is κ_k = exp(−d²/(2 r_k²))·sigmoid(w_k) = exp(−e_k). Only
+//! its ratios matter, so that all are taken relative to the strongest (e_0), and far from every node nothing
+//! underflows:
 //!
 //! > v_k = exp(e_0 − e_k), a_k = (v_k − v_c + ε) / Σ_j (v_j − v_c + ε) over the K strongest nodes,
 //!
 //! where c is the strongest one that does not count. A node that enters or leaves the K strongest does so with weight
-//! (nearly) zero: no cracks open where neighbours switch (the reference cuts off sharply). Σ a = 1 exactly as the sum of
-//! quotients, and ε keeps the sum above zero where K + 1 nodes pull alike.
+//! (nearly) zero: no cracks open where neighbours switch (the reference cuts off sharply). Σ a = 1 exactly as the sum
+//! of quotients, and ε keeps the sum above zero where K + 1 nodes pull alike.
 
 use super::tasks::{sum_parts, task_rows};
 use super::{MAX_HYPER, MAX_NEIGHBOURS, NODE_HYPER, NODE_LOG_RADIUS, SPARE_CANDIDATES, Skin};
@@ -34,7 +35,7 @@ const _: () = assert!(MAX_NEIGHBOURS + SPARE_CANDIDATES <= MAX_LIST, "a list fit
 /// The weights of all Gaussians.
 #[derive(Clone, Debug, Default)]
 pub struct Weights<F> {
-    /// Nodes that count a Gaussian, and whether one more cuts off.
+    /// Nodes that count per Gaussian, and whether one more cuts off.
     neighbours: usize,
     cut: bool,
     /// [N, neighbours + cut], strongest first.
@@ -115,11 +116,11 @@ fn coordinates<'a, F: Real>(
     into
 }
 
-/// The strongest nodes of a Gaussian: energies and numbers, ordered; more than are asked for mean nothing.
+/// The strongest nodes of a Gaussian: energies and numbers, ordered; more than are requested mean nothing.
 type Best<F> = ([F; MAX_LIST], [u32; MAX_LIST]);
 
 impl<F: Real> Weights<F> {
-    /// Nodes that count a Gaussian: K, or all where there are fewer.
+    /// Nodes that count per Gaussian: K, or all where there are fewer.
     pub(crate) fn neighbours(&self) -> usize {
         self.neighbours
     }
@@ -465,8 +466,8 @@ impl<F: Real> Kernel for Search<'_, F> {
     }
 }
 
-/// At most `count` of the rows of a geometry table, each the farthest from all before it; the first is the one nearest to
-/// the centroid. Rows that are not finite are left out. Equal distances: the lower row.
+/// At most `count` of the rows of a geometry table, each the farthest from all before it; the first is the one nearest
+/// to the centroid. Rows that are not finite are left out. Equal distances: the lower row.
 pub fn farthest_points<F: Real>(geometry: &Table<F>, count: usize) -> Vec<[F; 3]> {
     let points: Vec<[F; 3]> =
         (0..geometry.rows()).map(|r| geometry.read::<3>(r, 0)).filter(|x| x.iter().all(|c| c.is_finite())).collect();

@@ -6,7 +6,7 @@ use crate::nn::frames::{local_frames, mean, offsets};
 use crate::nn::ssm::{LANES, Lane};
 use crate::scene::{BLOCK, Params, Table};
 
-/// Neighbours whose offsets a node knows.
+/// Neighbours whose offsets are inputs of a node.
 const SEEN: usize = 4;
 /// Vectors that vector neurons get: from the centroid and to the neighbours.
 pub(crate) const VECTORS: usize = SEEN + 1;
@@ -22,11 +22,11 @@ pub(crate) fn width(e: Equivariance) -> usize {
     }
 }
 
-/// Takes the nodes' surroundings again, from where they are at rest. Call it after moving nodes by other means than training
-/// calls it.
+/// Takes the nodes' surroundings again, from where they are at rest. Call it after moving nodes by other means than
+/// training calls it.
 ///
-/// Shapes: `node_context` [nodes, 3 | 21 | 15]. Lengths are in units of the cloud's radius or of the neighbours' distance,
-/// so that a scaled scene is the same scene.
+/// Shapes: `node_context` [nodes, 3 | 21 | 15]. Lengths are in units of the cloud's radius or of the neighbours'
+/// distance, so that a scaled scene is the same scene.
 pub fn refresh<F: Real>(e: Equivariance, p: &mut Params<F>) {
     let nodes = p.find("nodes").expect("a skin has a table of nodes");
     let context = p.find(CONTEXT).expect("the model has made its table");
@@ -70,7 +70,7 @@ fn length(v: &[[f64; 3]]) -> f64 {
 /// The context of sixteen nodes.
 #[derive(Clone, Debug)]
 pub(crate) struct Around<F> {
-    /// Scalars that the network sees next to the embedding: a position, or offsets in the frame.
+    /// Scalar inputs of the network next to the embedding: a position, or offsets in the frame.
     pub scalars: Vec<Lane<F>>,
     /// Vectors [`VECTORS`], 3 that vector neurons see.
     pub vectors: Vec<Lane<F>>,

@@ -11,12 +11,12 @@ use crate::nn::vector::{VectorBlock, VectorTape};
 use crate::scene::{Grads, Key, Params};
 use std::ops::Range;
 
-/// Octaves in which a node sees its own position (without equivariance): down to 0.4 radii of the cloud.
+/// Octaves of the encoding of a node's position (without equivariance): down to 0.4 radii of the cloud.
 const PLACE_OCTAVES: usize = 5;
 /// Numbers of a tick of the clock next to γ: the impulses at the first and the last tick.
 const IMPULSES: usize = 2;
 
-/// Where the weights lie, and in which tables.
+/// Positions of the weights and their tables.
 #[derive(Clone, Debug)]
 pub(crate) struct Net {
     keys: Vec<Key>,
@@ -31,11 +31,11 @@ pub(crate) struct Net {
 
 #[derive(Clone, Debug)]
 enum Body {
-    /// Blocks of scalars, a gate \[H, own\] and a head \[6, H\], \[6\]. The gate is what a node multiplies the last channels by,
-    /// 1 + gate·own, so that nodes choose among the motions that all share.
+    /// Blocks of scalars, a gate \[H, own\] and a head \[6, H\], \[6\]. The gate is what a node multiplies the last
+    /// channels by, 1 + gate·own, so that nodes choose among the motions that all share.
     Scalar { blocks: Vec<Block>, gate: Range<usize>, head: [Range<usize>; 2] },
-    /// Coefficients \[C·VECTORS, H\], \[C·VECTORS\] that make C vectors of the node's, blocks of vectors, and a head: the shift
-    /// and two vectors whose cross product is the rotation, \[C\] each.
+    /// Coefficients \[C·VECTORS, H\], \[C·VECTORS\] that make C vectors of the node's, blocks of vectors, and a head:
+    /// the shift and two vectors whose cross product is the rotation, \[C\] each.
     Vector { channels: usize, coefficients: [Range<usize>; 2], blocks: Vec<VectorBlock>, head: [Range<usize>; 3] },
 }
 

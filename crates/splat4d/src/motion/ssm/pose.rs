@@ -4,7 +4,7 @@ use crate::math::{Real, quat};
 use crate::nn::ssm::{LANES, Lane};
 use crate::simd::each;
 
-/// Below this |θ|² sine and cosine come from their series, radians squared (the terms left out are below 1e-17).
+/// Below this |θ|² sine and cosine are computed by their series, radians squared (the terms left out are below 1e-17).
 const SMALL_ANGLE: f64 = 1e-4;
 
 /// The ticks around a time, with Catmull-Rom weights and their slopes.
@@ -17,7 +17,8 @@ pub(crate) struct Knots<F> {
 }
 
 impl<F: Real> Knots<F> {
-    /// Around `u`, in ticks; `per_second` ticks a second. Before the first and after the last tick the nearest one counts.
+    /// Around `u`, in ticks; `per_second` ticks a second. Before the first and after the last tick the nearest one
+    /// counts.
     pub(crate) fn new(u: f64, per_second: f64, last: usize) -> Self {
         let inside = u > 0.0 && u < last as f64;
         let u = if u.is_nan() { 0.0 } else { u.clamp(0.0, last as f64) };
@@ -49,8 +50,8 @@ impl<F: Real> Knots<F> {
     }
 }
 
-/// The pose at the knots of one node's ticks \[ticks, 6 or 7\]: shift 3, quaternion residual 4; and the numbers that were
-/// interpolated.
+/// The pose at the knots of one node's ticks \[ticks, 6 or 7\]: shift 3, quaternion residual 4; and the numbers that
+/// were interpolated.
 pub(crate) fn at<F: Real>(own: &[F], width: usize, knots: &Knots<F>) -> ([F; 7], [F; 7]) {
     let mut x = [F::ZERO; 7];
     for (&tick, &w) in knots.ticks.iter().zip(&knots.weights) {
@@ -106,8 +107,8 @@ pub(crate) fn exp_backward<F: Real>(theta: [F; 3], d: [F; 4]) -> [F; 3] {
     each(|k| s * d[k + 1] + F::TWO * theta[k] * d_square)
 }
 
-/// Poses \[7, ticks\] of rates \[6, ticks\]: the first tick's is the first pose, the others last `share` of a clip each:
-/// ρₙ = ρₙ₋₁ + share·ξₙ, qₙ = qₙ₋₁ ⊗ exp(share·ωₙ).
+/// Poses \[7, ticks\] of rates \[6, ticks\]: the first tick's is the first pose, the others last `share` of a clip
+/// each: ρₙ = ρₙ₋₁ + share·ξₙ, qₙ = qₙ₋₁ ⊗ exp(share·ωₙ).
 pub(crate) fn compose<F: Real>(rates: &[Lane<F>], share: f64) -> Vec<Lane<F>> {
     let ticks = rates.len() / 6;
     let mut out = vec![[F::ZERO; LANES]; 7 * ticks];

@@ -1,4 +1,4 @@
-//! Equivariance and its negative controls, permutations, baked ticks, hostile specs; the fit stands in `study`.
+//! Equivariance and its negative controls, permutations, baked ticks, hostile specs; the fit is in `study`.
 
 mod study;
 
@@ -98,7 +98,7 @@ fn error(spec: &SsmSpec, rest: &[[f64; 7]], g: &Motion3) -> (f64, f64) {
     (worst, size)
 }
 
-/// The answer for the scene that was not moved.
+/// The result for the scene that was not moved.
 fn at_rest(spec: &SsmSpec) -> Vec<[f64; 7]> {
     let (p, of) = field(spec, &Motion3::identity());
     poses(&p, &of)
@@ -108,7 +108,7 @@ const ABSOLUTE: (Output, Mode) = (Output::Absolute, Mode::Bidirectional);
 const TWIST: (Output, Mode) = (Output::Twist, Mode::Causal);
 
 #[test]
-fn fifty_motions_of_the_scene_move_the_answer_alike() {
+fn results_are_equivariant_to_fifty_motions_of_the_scene() {
     for (e, mirrors) in [(Equivariance::Frames, false), (Equivariance::Vector, false), (Equivariance::Vector, true)] {
         for (output, mode) in [ABSOLUTE, TWIST] {
             let spec = small(e, output, mode);
@@ -123,8 +123,8 @@ fn fifty_motions_of_the_scene_move_the_answer_alike() {
 }
 
 #[test]
-fn what_is_not_equivariant_is_found_out() {
-    // The same test must fail for a network that knows where nodes are, and for frames where the scene is mirrored.
+fn non_equivariant_networks_are_detected() {
+    // The same test must fail for a network with positions as inputs, and for frames where the scene is mirrored.
     for (e, mirrors) in [(Equivariance::None, false), (Equivariance::None, true), (Equivariance::Frames, true)] {
         let spec = small(e, Output::Absolute, Mode::Bidirectional);
         let rest = at_rest(&spec);

@@ -61,7 +61,7 @@ fn propagation_turns_on_whatever_the_signs_and_scales_of_quaternions() {
 }
 
 #[test]
-fn a_step_is_carried_on_no_further_than_the_cap() {
+fn extrapolation_is_bounded_by_the_cap() {
     let (mut p, model) = start(1);
     let model = model.propagate(&mut p, 0.1, 0.5).unwrap();
     let start = p[GEOMETRY].read::<3>(0, 0);

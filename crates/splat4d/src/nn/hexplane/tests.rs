@@ -11,7 +11,7 @@ fn planes(shape: PlaneShape) -> (Params<f64>, Planes) {
     (p, planes)
 }
 
-/// Sets every plane: f(plane, place along its axes in [0, 1], channel).
+/// Sets every plane: f(plane, position along its axes in [0, 1], channel).
 fn set(p: &mut Params<f64>, planes: &Planes, f: impl Fn(usize, [f64; 2], usize) -> f64) {
     for (level, keys) in planes.keys().iter().enumerate() {
         for (plane, &key) in keys.iter().enumerate() {
@@ -181,7 +181,7 @@ fn swapped_axes_of_points_and_planes_are_swapped_features() {
     set(&mut p, &planes, f);
     let x = points(40);
     let before = features(&p, &planes, 2, &x, 0.6);
-    // x and y change places: xy is transposed, xz and yz, xt and yt are exchanged.
+    // x and y change positions: xy is transposed, xz and yz, xt and yt are exchanged.
     set(&mut p, &planes, |plane, [u, v], c| match plane {
         0 => f(0, [v, u], c),
         1 => f(3, [u, v], c),

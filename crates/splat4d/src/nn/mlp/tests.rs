@@ -88,7 +88,7 @@ fn without_hidden_layers_it_is_one_linear_map_and_a_skip_sees_the_input() {
         let sum: f64 = (0..3).map(|i| w.get(3 * o + i, 0) * x[i]).sum::<f64>() + b.get(o, 0);
         assert!((out[o] - sum).abs() < 1e-12);
     }
-    // The last map of this one sees [hidden 4, input 2]: with zero hidden layers only the input is left.
+    // The last map of this one has the inputs [hidden 4, input 2]: with zero hidden layers only the input is left.
     let (mut p, mlp) = made::<f64>(SHAPES[3]);
     for map in &mlp.maps[..2] {
         p[map.weight].fill(0.0);
@@ -143,7 +143,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
     };
     let one = run(1, false);
     assert!(one == run(3, false) && one == run(4, true));
-    // A row's answer does not depend on how many rows are asked.
+    // A row's result does not depend on the number of rows.
     let mut alone = vec![0.0; 5];
     mlp.forward(&p, &x[7 * 500..][..7], &mut alone);
     let worst = alone.iter().zip(&one.0[5 * 500..]).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -155,7 +155,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
 
 #[test]
 fn a_shift_is_an_input_that_all_rows_share() {
-    // The same network with the shared input standing in every row.
+    // The same network with the shared input repeated in every row.
     let shape = MlpShape { inputs: 3, width: 6, layers: 2, skip: Some(0), outputs: 2 };
     let (p, mlp) = made::<f64>(shape);
     let x = numbers::<f64>(5 * 3, 1);

@@ -105,7 +105,7 @@ fn windows_with_carried_states_and_any_chunk_equal_the_whole_scan() {
 }
 
 #[test]
-fn a_scan_forward_never_sees_the_future() {
+fn a_forward_scan_does_not_depend_on_the_future() {
     let (ticks, of) = (20, Discrete::new(SHAPE, &weights_of(SHAPE, 7), &[1.0]));
     let u = random(3 * ticks, 8);
     let mut other = u.clone();
@@ -182,8 +182,8 @@ fn the_gradient_equals_differences_everywhere() {
 
 #[test]
 fn uneven_ticks_sample_the_same_response_to_first_order() {
-    // A smooth input on even ticks, and on ticks moved by up to a third: y at the same moment nearly agrees, and twice
-    // as near with half the step.
+    // A smooth input on even ticks, and on ticks moved by up to a third: y at the same time nearly agrees, and twice as
+    // near with half the step.
     let shape = Shape { channels: 1, states: 4, copies: 1 };
     let w = weights_of(shape, 14);
     let error = |ticks: usize| {
@@ -200,7 +200,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
         let other = Discrete::<f64>::new(shape, &w, &moved);
         let a = scan(&steady, Direction::Forward, &even, &steady.rest()).0;
         let b = scan(&other, Direction::Forward, &uneven, &other.rest()).0;
-        // Every second tick stands at the same moment.
+        // Every second tick is at the same time.
         (1..ticks).step_by(2).map(|t| (a[t][0] - b[t][0]).abs()).fold(0.0, f64::max)
     };
     let (coarse, fine) = (error(80), error(160));
@@ -209,8 +209,8 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
 
 #[test]
 fn missing_gradients_of_chunks_and_ticks_equal_zero_gradients() {
-    // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part of
-    // a longer one whose rest has no gradient.
+    // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part
+    // of a longer one whose rest has no gradient.
     let of = Discrete::new(SHAPE, &weights_of(SHAPE, 15), &[1.0]);
     let long = 3 * CHUNK + 5;
     let u = random(3 * long, 16);

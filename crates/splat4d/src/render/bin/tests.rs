@@ -39,7 +39,7 @@ fn touches(foot: &Footprint, x: usize, y: usize) -> bool {
 }
 
 #[test]
-fn lists_are_what_a_stable_sort_of_all_pairs_gives() {
+fn lists_equal_a_stable_sort_of_all_pairs() {
     let [across, down] = [21, 11];
     let feet = footprints(CHUNK + 700, [across, down]);
     let mut bins = Bins::default();
@@ -77,7 +77,7 @@ fn lists_are_what_a_stable_sort_of_all_pairs_gives() {
 fn sort_is_a_sort() {
     let rng = Rng::new(4, "sort", 0);
     // Spread evenly, all equal, one far away, in reverse, close together but for one: insertions alone would take
-    // for ever over the last.
+    // forever over the last.
     let depths: [fn(f64, usize, usize) -> f32; 5] = [
         |u, _, _| 0.3 + 4.0 * u as f32,
         |_, _, _| 2.5,

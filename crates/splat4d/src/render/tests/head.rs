@@ -21,7 +21,7 @@ impl Headed {
         let numbers =
             |k: u64, count: usize| -> Vec<f64> { (0..count).map(|i| 0.7 * rng.fork(k).normal(i as u64)).collect() };
         let mut first: Vec<f64> = numbers(2, HIDDEN * INPUTS);
-        // The camera stands far down z: every hidden number is above zero somewhere.
+        // The camera is far down z: every hidden number is above zero somewhere.
         first.iter_mut().skip(FURTHER + 2).step_by(INPUTS).for_each(|w| *w = -1.0);
         Self { scene, first, second: numbers(3, 3 * HIDDEN) }
     }
@@ -59,7 +59,7 @@ fn images_with_a_head_equal_the_oracle() {
 fn the_network_is_a_matrix_product_a_pixel() {
     let (s, view) = (Headed::new(20, 0.3), camera(33, 21));
     let got = s.draw(&view, BACKGROUND).color;
-    // Without a head the same splats are drawn with their features as further channels.
+    // Without a head the same splats are rendered with their features as further channels.
     let n = s.scene.splats().len();
     let mut channels = Table::new(&[("further", FURTHER)], n);
     for j in 0..s.scene.direct.rows() {

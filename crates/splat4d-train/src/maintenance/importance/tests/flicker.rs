@@ -1,4 +1,5 @@
-//! A still backdrop that every short life repeats: four of five Gaussians are superfluous, and the score finds them.
+//! A still backdrop that every short lifespan repeats: four of five Gaussians are superfluous, and the score finds
+//! them.
 
 use super::*;
 use crate::eval::metrics::psnr;
@@ -9,7 +10,7 @@ use crate::step::trainer::{Settings, Trainer};
 use crate::train_state::TrainState;
 use std::sync::Arc;
 
-/// Gaussians of the truth, and for each of them so many that only flicker.
+/// Gaussians of the truth, and for each of them this many that only flicker.
 const TRUTH: usize = 60;
 const REPEATS: usize = 4;
 /// Steps of training before and after pruning.
@@ -134,10 +135,10 @@ fn a_flickering_copy_of_the_background_is_pruned_and_the_image_stays() {
     assert!(random < after - 1.0, "{random} dB at random, {after} dB by score");
 }
 
-/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state goes on
+/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state continues
 /// alike.
 #[test]
-fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
+fn rows_are_pruned_during_training_and_the_run_repeats() {
     let start = || Scene { layers: vec![layer(200, LifeKind::GaussHalf, 7)], clip: [0.0, 0.8], fps: 10.0, ..scene(2) };
     let frames = made();
     let pictures =

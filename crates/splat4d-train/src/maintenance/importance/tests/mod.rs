@@ -15,10 +15,10 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Part, Rows, SH, Splats, Time};
 
-/// Cameras, moments and pixels across of the synthetic capture; ten frames a second.
+/// Cameras, times and width in pixels of the synthetic capture; ten frames per second.
 const CAPTURE: (usize, usize, usize) = (3, 9, 40);
 
-/// A layer of Gaussians around the origin, with lives of random lengths about random moments of the clip.
+/// A layer of Gaussians around the origin, with lifespans of random lengths about random times of the clip.
 fn layer(rows: usize, life: LifeKind, seed: u64) -> Layer<f32> {
     let rng = Rng::new(seed, "prune", 0);
     let mut params = Params::new(rows, 1, life.columns());
@@ -40,7 +40,7 @@ fn layer(rows: usize, life: LifeKind, seed: u64) -> Layer<f32> {
     Layer::new("made up", params, motion, life)
 }
 
-/// Two layers, of which one lives for ever.
+/// Two layers, of which one has an infinite lifespan.
 fn scene(rows: usize) -> Scene<f32> {
     let layers = vec![layer(rows, LifeKind::GaussHalf, 1), layer(rows / 2, LifeKind::Infinite, 2)];
     Scene { layers, clip: [0.0, 0.8], fps: 10.0, ..Scene::default() }
@@ -54,7 +54,7 @@ fn scored(scene: &Scene<f32>, frames: &dyn Frames, config: &ScoreConfig) -> Scor
     score(scene, frames, config, &mut |_, _| {}).unwrap()
 }
 
-/// Draws frame i of a capture.
+/// Renders frame i of a capture.
 fn drawn(scene: &Scene<f32>, frames: &dyn Frames, i: usize) -> Image<f32> {
     let (mut instant, mut image) = (Evaluation::default(), Image::default());
     scene.at(frames.time(i), &mut instant);
@@ -98,7 +98,7 @@ impl Frames for Again {
 }
 
 #[test]
-fn spatial_scores_sum_to_what_the_images_cover_and_double_with_them() {
+fn spatial_scores_sum_to_the_covered_pixels_and_double_with_the_images() {
     let (s, made) = (scene(400), made());
     let scores = scored(&s, &made, &ScoreConfig::default());
     let sum: f64 = scores.spatial.iter().flatten().sum();
@@ -194,7 +194,7 @@ fn pruning_ranks_all_layers_together_and_keeps_one_gaussian() {
     assert!(prune(&s, &scores, 0.5).iter().all(|e| e.space == Space::Gaussians));
 }
 
-/// The rows that a life leaves draw the very image of all rows: what it hides is below the blend's cut-off.
+/// The rows that a lifespan leaves draw the very image of all rows: what it hides is below the blend's cut-off.
 #[test]
 fn interval_buckets_return_every_active_row() {
     let (s, made) = (scene(400), made());

@@ -1,5 +1,5 @@
 //! Survival of transient objects: the orb of the bundled capture, which appears at frame 9, and its painted crate,
-//! which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
+//! which vanishes at frame 18 (docs/bundled-capture.md). Without fine-tuning.
 
 use super::*;
 use crate::capture::{Capture, CaptureOptions, ImageStore};
@@ -17,19 +17,19 @@ const CRATE: ([f64; 3], f64) = ([-0.55, 0.4, 1.75], 0.5);
 const FRAMES: usize = 30;
 const EVERY: usize = 3;
 
-/// Of the views at a time one in so many is scored by: one at every time.
+/// Of the views at a time one in n is scored by: one at every time.
 const VIEWS: usize = 16;
 /// A share of the Gaussians, and its permitted loss in either, without fine-tuning, dB.
 const FEW: f64 = 0.35;
 const LOST: f64 = 1.5;
-/// The orb's pixels where only the hall behind it is drawn are below this, dB.
+/// The orb's pixels where only the hall behind it is rendered are below this, dB.
 const GONE: f64 = 12.0;
 
 fn mix(a: [f64; 3], b: [f64; 3], s: f64) -> [f64; 3] {
     [0, 1, 2].map(|k| a[k] + s * (b[k] - a[k]))
 }
 
-/// Where the orb is at a frame: the curve along which the capture was drawn.
+/// Where the orb is at a frame: the curve along which the capture was rendered.
 fn orb(frame: usize) -> [f64; 3] {
     let s = (frame - ORB_APPEARS) as f64 / (FRAMES - ORB_APPEARS) as f64;
     let (a, b, c) = ([0.75, 1.25, 0.75], [0.3, 2.9, 1.0], [-1.3, 2.1, 0.3]);
@@ -102,7 +102,7 @@ fn the_orb_and_the_crate_survive() {
         assert!(few[k] > before[k] - LOST, "{before:?} dB, without a share of {FEW} of the Gaussians {few:?}");
         assert!(half[k] > GONE + 3.0, "with half {half:?}");
     }
-    // Variance as the score of a life: what does not last goes whatever it shows.
+    // Variance as the score of a lifespan: what does not last goes whatever it shows.
     let lasting = left(&scene, &held, &scores(Spatial::Share, Temporal::Width), 0.5);
     assert!(lasting[0] < GONE, "{lasting:?} where length counts");
     // Coverage alone: the orb is small, and nothing else is gone so fast.

@@ -1,4 +1,4 @@
-//! Layers that are pages: there and back, at any depth, and the coder against the file.
+//! Layers that are pages: round trips, at any depth, and the coder against the file.
 
 use super::*;
 use crate::layers::Layer;
@@ -12,7 +12,7 @@ fn pages(n: usize, degree: usize, seed: u64) -> Pages {
 }
 
 /// Pages that have been trained for a while: every number of every table has moved a little, quaternions are no longer
-/// unit, and some Gaussians die that lived for ever.
+/// unit, and some Gaussians with infinite lifespans get finite ones.
 fn trained(n: usize, degree: usize, seed: u64) -> Pages {
     let mut pages = pages(n, degree, seed);
     for (l, layer) in pages.layers.iter_mut().enumerate() {
@@ -49,12 +49,12 @@ fn bits(layer: &Layer<f32>) -> Vec<u32> {
 }
 
 #[test]
-fn the_coder_shows_what_a_reader_of_the_file_sees_bit_for_bit() {
+fn the_coder_equals_a_reader_bit_for_bit() {
     let least =
         Depths { position: 2, center: 2, scale: 2, opacity: 2, rotation: 2, shift: 2, turn: 2, color: 2, life: 2 };
     for (degree, depths) in [(0, Depths::default()), (1, coarse()), (3, Depths::default()), (2, least)] {
         let mut pages = trained(2300, degree, 20 + degree as u64);
-        // Numbers at the edge of what there is.
+        // Numbers at the edge of the range.
         let p = &mut pages.layers[0].params;
         p[GEOMETRY].write(0, QUAT, [0.0; 4]);
         p[GEOMETRY].write(1, LOG_SCALE, [-300.0, 60.0, 0.0]);
@@ -88,7 +88,7 @@ fn the_coder_shows_what_a_reader_of_the_file_sees_bit_for_bit() {
 }
 
 #[test]
-fn only_wanted_blocks_change() {
+fn only_selected_blocks_change() {
     let pages = trained(2300, 1, 30);
     let (layer, labels) = (&pages.layers[0], &pages.labels[0]);
     let rows = layer.params.len();
@@ -114,7 +114,7 @@ fn only_wanted_blocks_change() {
 }
 
 #[test]
-fn pages_as_they_are_come_back_almost_unchanged() {
+fn unchanged_pages_round_trip_almost_exactly() {
     let pages = pages(3000, 2, 31);
     let again = read_pages(&written(&pages, Depths::default())).unwrap();
     for (a, b) in pages.layers.iter().zip(&again.layers) {
@@ -125,13 +125,13 @@ fn pages_as_they_are_come_back_almost_unchanged() {
                 (moved, total) = (moved + usize::from((x - y).abs() > 1e-5 * (1.0 + x.abs())), total + 1);
             }
         }
-        // A life that as decoded spans all of its page becomes one for ever, and moves its centre.
+        // A lifespan that as decoded spans all of its page becomes infinite, and moves its centre.
         assert!(1000 * moved < total, "{moved} of {total} numbers moved");
     }
 }
 
 #[test]
-fn a_layer_becomes_primitives_and_a_layer_again() {
+fn layers_round_trip_through_primitives() {
     let pages = trained(1200, 1, 32);
     for (layer, labels) in pages.layers.iter().zip(&pages.labels) {
         let p = primitives(layer);
@@ -193,7 +193,7 @@ fn coarse_codes_leave_their_low_bits_alone() {
         assert!(page.words.iter().all(|w| [0, 255].contains(&(w[6] >> 24)) || (w[6] >> 24) % 8 == 1));
         assert!(page.words.iter().any(|w| w[6] >> 24 == 255));
     }
-    // Synthetic numbers are noise: what is saved is what the low bits would have cost.
+    // Synthetic numbers are noise: the saving is the cost of the low bits.
     let stored = |file: &[u8]| -> u32 { Index::parse(file, None).unwrap().pages().map(|(_, e)| e.stored).sum() };
     let (few, all) = (stored(&file), stored(&written(&pages, Depths::default())));
     assert!(100 * few < 80 * all, "{few} bytes instead of {all}");
@@ -223,7 +223,7 @@ fn coarse_codes_are_half_a_step_off_at_most() {
 }
 
 #[test]
-fn what_cannot_be_coded_is_named() {
+fn uncodable_layers_are_named() {
     let refused = |change: fn(&mut Pages, &mut Depths)| {
         let (mut pages, mut depths) = (pages(400, 1, 35), Depths::default());
         change(&mut pages, &mut depths);
@@ -253,7 +253,7 @@ fn what_cannot_be_coded_is_named() {
 }
 
 #[test]
-fn a_file_of_several_palettes_is_no_file_to_work_on() {
+fn files_with_several_palettes_are_refused() {
     let (file, _) = bytes_of(&made_up(400, 1, 38), &WriteConfig::default());
     assert_eq!(read_pages(&file).unwrap().scene().len(), 400);
     let mut index = Index::parse(&file, None).unwrap();

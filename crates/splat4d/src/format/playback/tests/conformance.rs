@@ -1,5 +1,6 @@
-//! The conformance set of docs/format.md: small files, one per feature, with the numbers that a reader has to get from them,
-//! and files that it has to refuse. `UPDATE_GOLDEN=1` writes the set; otherwise it is read, so that later versions still read it.
+//! The conformance set of docs/format.md: small files, one per feature, with the numbers that a reader has to get from
+//! them, and files that it has to refuse. `UPDATE_GOLDEN=1` writes the set; otherwise it is read, so that later
+//! versions still read it.
 
 use super::hostile::{reseal, with_entry};
 use super::*;
@@ -14,7 +15,8 @@ use std::sync::Arc;
 const LISTED: usize = 6;
 /// Colours are those seen from here.
 const EYE: [f64; 3] = [0.5, -1.0, -4.0];
-/// Least relative distance of an opacity from the threshold below which nothing is rendered: readers may compute in f32.
+/// Least relative distance of an opacity from the threshold below which nothing is rendered: readers may compute in
+/// f32.
 const CLEAR: f64 = 1e-4;
 /// Digits of the numbers.
 const DIGITS: i32 = 7;
@@ -143,7 +145,8 @@ fn growing() -> Vec<u8> {
     growing.file().get_ref().clone()
 }
 
-/// What later versions may add: a minor version, a key of the JSON, an optional section; and a page without its palette.
+/// What later versions may add: a minor version, a key of the JSON, an optional section; and a page without its
+/// palette.
 fn newer() -> Vec<u8> {
     let mut draft = scene(24, 2, 18);
     draft.poster = Some(b"whatever it is".to_vec());
@@ -159,7 +162,7 @@ fn newer() -> Vec<u8> {
     bytes
 }
 
-/// The set: names, what each has, and bytes.
+/// The set: names, contents and bytes.
 fn set() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let plain = |draft: &Draft| bytes_of(draft, &WriteConfig::default()).0;
     let coarse =
@@ -395,13 +398,15 @@ fn the_conformance_set_gives_its_numbers() {
 /// Files of the set that a writer of this version would not write, and in what they deviate.
 fn deviations(name: &str) -> Vec<String> {
     match name {
-        "newer" => vec!["the minor version is 9, this splat4d knows 2".into(), "section 0: `WAVE` is not known".into()],
+        "newer" => {
+            vec!["the minor version is 9, this splat4d supports 2".into(), "section 0: `WAVE` is not known".into()]
+        }
         _ => Vec::new(),
     }
 }
 
 #[test]
-fn the_conformance_set_names_what_to_refuse() {
+fn the_conformance_set_names_files_to_refuse() {
     let list = std::fs::read_to_string(folder().join("refused/refused.json")).unwrap();
     let list: serde_json::Map<String, Value> = serde_json::from_str(&list).unwrap();
     assert_eq!(list.len(), refused().len());
@@ -414,7 +419,7 @@ fn the_conformance_set_names_what_to_refuse() {
 }
 
 #[test]
-fn strict_names_what_readers_tolerate() {
+fn strict_names_deviations_that_readers_tolerate() {
     let (sample, _) = bytes_of(&scene(300, 1, 20), &WriteConfig { deflate_level: 0, ..WriteConfig::default() });
     assert!(strict(&sample).unwrap().is_empty());
     let index = Index::parse(&sample, None).unwrap();
@@ -437,7 +442,7 @@ fn strict_names_what_readers_tolerate() {
     told(with_entry(&sample, page, 4, &[3]), "section 0: unknown flags");
     told(with_entry(&sample, page, 4, &[0]), "section 0: `PAGE` is not marked as required");
     told([&sample[..], b"more"].concat(), "4 bytes after the end");
-    // The life of a block that ends when it begins, and spare bits of word 7.
+    // The lifespan of a block that ends when it begins, and spare bits of word 7.
     told(changed(body + 36, &sample[body + 32..body + 36]), "block 0: visible");
     let planes = body + 96 * n.div_ceil(256);
     told(changed(planes + 31 * n, &[1]), "spare bits");

@@ -1,4 +1,4 @@
-//! Feature channels in the file: there and back, skipped by who does not know them, and damaged.
+//! Feature channels in the file: round trip, skipped by readers without support, and damaged.
 
 use super::hostile::survive;
 use super::*;
@@ -29,7 +29,7 @@ fn of(scene: &Scene<f32>) -> Vec<(f32, Vec<f32>)> {
 }
 
 #[test]
-fn features_come_back_through_drafts_and_pages() {
+fn features_round_trip_through_drafts_and_pages() {
     let draft = featured(400);
     let (bytes, _) = bytes_of(&draft, &WriteConfig::default());
     let index = Index::parse(&bytes, None).unwrap();

@@ -1,4 +1,5 @@
-//! Files that grow: what is there plays at any time, and what is finished is a file like any other, in whatever order it was added.
+//! Files that grow: the present part plays at any time, and a finished file is like any other, in whatever order it was
+//! added.
 
 use super::*;
 use std::io::{Cursor, ErrorKind as Io, Read, Seek, SeekFrom, Write};
@@ -19,7 +20,7 @@ fn added<F: Read + Write + Seek>(file: &mut Growing<F>, part: &[u8], meta: Meta)
     file.append(part, meta, &mut |_| Ok(()))
 }
 
-/// What a file shows, by the place of its first Gaussian.
+/// What a file shows, by the position of its first Gaussian.
 fn shown(bytes: &[u8], t: f64) -> Vec<[f64; 3]> {
     let scene = read(bytes).unwrap();
     let layers = scene.layers.iter().filter(|l| l.span[0] <= t && t < l.span[1]);
@@ -38,15 +39,15 @@ fn a_growing_file_plays_and_readers_of_an_older_header_are_not_disturbed() {
     assert_eq!([&first, &second].map(|b| shown(b, 0.7).len()), [0, 1]);
     assert_eq!((shown(&first, 0.2).len(), shown(&first, 0.2)), (1, shown(&second, 0.2)));
     assert_eq!(second[64..first.len()], first[64..], "nothing but the header is written again");
-    // The first header, and all that has come since.
+    // The first header, and all later content.
     let stale = [&first[..64], &second[64..]].concat();
     assert_eq!(read(&stale).unwrap().clip, [0.0, 0.5]);
-    // By its start alone it is known where the index lies.
+    // Its start alone gives the index's position.
     let place = Index::place(&second[..64]).unwrap();
     let index = Index::of(&second[..64], &second[place.start as usize..place.end as usize]).unwrap();
     assert_eq!((index.meta.parts.clone(), index.meta.gaussians), (vec!["0".into(), "1".into()], 1800 - 2 * 450));
     assert!(Index::grows(&second) && index == Index::parse(&second, None).unwrap());
-    // Who goes on with the file finds what is in it.
+    // Who continues with the file finds what is in it.
     let again = Growing::open(Cursor::new(second)).unwrap();
     assert_eq!(again.index(), &index);
     assert!(Growing::open(Cursor::new(part(1, 0.0))).is_err(), "a finished file grows no more");
@@ -80,7 +81,7 @@ fn the_finished_file_does_not_depend_on_the_order_of_chunks() {
     assert!(finish(&mut Cursor::new(cut), meta(1.0, &[]), None, &mut Vec::new()).is_err());
 }
 
-/// A disk with so many bytes.
+/// A disk with this many bytes.
 struct Small(Cursor<Vec<u8>>, usize);
 
 impl Read for Small {
@@ -107,7 +108,7 @@ impl Write for Small {
 }
 
 #[test]
-fn on_a_full_disk_the_file_stays_what_it_was_and_grows_once_there_is_room() {
+fn on_a_full_disk_the_file_is_unchanged_and_grows_later() {
     let [one, two] = [part(1, 0.0), part(2, 0.5)];
     let room = one.len() + two.len() / 2;
     let mut growing = Growing::begin(Small(Cursor::new(Vec::new()), room), meta(0.0, &[])).unwrap();

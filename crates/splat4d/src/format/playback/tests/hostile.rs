@@ -82,7 +82,7 @@ fn mutants_are_read_or_refused() {
 
 #[test]
 fn bytes_of_headers_and_tables_are_each_tried() {
-    // A small file whose every byte before the bodies takes nasty values, checksums mended.
+    // A small file whose every byte before the bodies takes nasty values, checksums corrected.
     let (sample, _) = bytes_of(&tiny(), &WriteConfig::default());
     let end = Index::needed(&sample).unwrap();
     for at in 8..end {
@@ -100,7 +100,7 @@ fn bytes_of_headers_and_tables_are_each_tried() {
     }
 }
 
-/// The sample with some bytes of entry `i` replaced, checksums mended.
+/// The sample with some bytes of entry `i` replaced, checksums corrected.
 pub(super) fn with_entry(sample: &[u8], i: usize, at: usize, bytes: &[u8]) -> Vec<u8> {
     let mut m = sample.to_vec();
     let first = table(sample) + 64 * i + at;
@@ -157,7 +157,7 @@ fn inconsistent_sizes_are_refused_by_name() {
     assert!(told(page, 8, &64u64.to_le_bytes()).contains("overlaps"));
     assert!(told(palette, 30, &4u16.to_le_bytes()).contains("degree 4"));
     assert!(told(palette, 32, &70_000u32.to_le_bytes()).contains("70000 entries"));
-    // One entry less than the pages' labels ask for, all sizes consistent: found when the page is expanded.
+    // One entry less than the pages' labels request, all sizes consistent: found when the page is expanded.
     let raw = bytes_of(&tiny(), &WriteConfig { deflate_level: 0, ..WriteConfig::default() }).0;
     let less = with_entry(&raw, palette, 32, &1u32.to_le_bytes());
     let less = with_entry(&less, palette, 20, &(12 + 9u32).to_le_bytes());
@@ -178,7 +178,7 @@ fn inconsistent_sizes_are_refused_by_name() {
 }
 
 #[test]
-fn numbers_that_are_no_numbers_are_refused() {
+fn non_finite_numbers_are_refused() {
     let (sample, _) = bytes_of(&tiny(), &WriteConfig { deflate_level: 0, ..WriteConfig::default() });
     let index = Index::parse(&sample, None).unwrap();
     let first = index.sections[1].offset as usize;

@@ -1,4 +1,4 @@
-//! Labels in the file: there and back, skipped by who does not know them, and damaged.
+//! Labels in the file: round trip, skipped by readers without support, and damaged.
 
 use super::hostile::{reseal, survive};
 use super::*;
@@ -24,7 +24,7 @@ fn counts(scene: &Scene<f32>) -> [usize; 4] {
 }
 
 #[test]
-fn labels_come_back_through_drafts_and_pages() {
+fn labels_round_trip_through_drafts_and_pages() {
     let draft = labelled(400);
     let (bytes, _) = bytes_of(&draft, &WriteConfig::default());
     let index = Index::parse(&bytes, None).unwrap();

@@ -1,4 +1,4 @@
-//! Masks in the file: there and back, drawn, and damaged.
+//! Masks in the file: round trip, rendered, and damaged.
 
 use super::hostile::{reseal, survive, with_entry};
 use super::*;
@@ -85,7 +85,7 @@ fn a_player_renders_the_gaussians_that_masks_admit() {
         }
     }
     assert!(0 < drawn && 10 * drawn < 8 * alive, "masks leave {drawn} of {alive}");
-    // Without the sections all are drawn: what an older reader does.
+    // Without the sections all are rendered: as in an older reader.
     let mut old = Index::parse(&bytes, None).unwrap();
     let bodies: Vec<Vec<u8>> = old.sections.iter().map(|e| stored(&bytes, e).to_vec()).collect();
     old.sections.iter_mut().filter(|e| e.kind == Kind::Masks).for_each(|e| {

@@ -1,5 +1,5 @@
-//! Against a perceptron and a spline: node paths of several frequencies, learnt by all with the same steps, rate and about as
-//! many numbers; then they are asked for the 50 ticks after the last that they saw.
+//! Against a perceptron and a spline: node paths of several frequencies, learnt by all with the same steps, rate and
+//! about as many numbers; then they are queried for the 50 ticks after the last that they saw.
 
 use super::*;
 use crate::motion::control::{Curve, Keys, Timeline};
@@ -8,7 +8,7 @@ use crate::nn::encoding::{encode, encoded};
 use crate::nn::{InputGrad, Mlp, MlpShape, Passed};
 
 const SOURCES: usize = 16;
-/// Ticks past the end that are asked for.
+/// Ticks past the end that are requested.
 const AHEAD: usize = 50;
 /// Octaves of the perceptron's clock (SC-GS: 6 to 10).
 const OCTAVES: usize = 8;
@@ -20,7 +20,8 @@ fn path(node: usize, second: f64) -> [f64; 3] {
     [x, (2.0 * second + phase).cos(), (2.0 * second + phase).sin()]
 }
 
-/// Everywhere at random, with a turn about every two seconds: the motion of one node predicts neither another's nor its own later motion.
+/// Everywhere at random, with a turn about every two seconds: the motion of one node predicts neither another's nor its
+/// own later motion.
 fn wander(node: usize, second: f64) -> [f64; 3] {
     let rng = Rng::new(7, "wander", 0).fork(node as u64);
     std::array::from_fn(|axis| {
@@ -217,7 +218,7 @@ fn causal(ticks: usize, seconds: f64) -> SsmSpec {
 
 /// Ten seconds at thirty ticks a second.
 #[test]
-fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
+fn node_paths_are_learnt_and_extrapolated_better_than_by_a_perceptron() {
     let steps = 150;
     let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), path, 300, steps), fit_mlp(path, 300, 10.0, 64, steps));
     println!("10 s, {steps} steps: ssm {ssm}, mlp {mlp}");
@@ -226,8 +227,9 @@ fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
     assert!(1.1 * ssm.ahead < mlp.ahead, "{ssm}; {mlp}");
 }
 
-/// Compares node paths over a minute at fifteen samples a second. With `STUDY=1` it prints the figures of docs/models.md, which
-/// takes minutes in a release build; otherwise it checks on a second of them that every model still fits to finite errors.
+/// Compares node paths over a minute at fifteen samples a second. With `STUDY=1` it prints the figures of
+/// docs/models.md, which takes minutes in a release build; otherwise it checks on a second of them that every model
+/// still fits to finite errors.
 #[test]
 fn a_minute_of_node_paths() {
     let full = std::env::var_os("STUDY").is_some();
