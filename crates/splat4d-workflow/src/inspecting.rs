@@ -22,7 +22,7 @@ use splat4d::{Error, Result};
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::output::{Owner, check_apart};
+use splat4d_train::output::{Owner, check_apart, check_no_capture};
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::ChunkEstimate;
@@ -82,6 +82,8 @@ pub struct Inspection {
     pub troubles: Vec<String>,
     /// More reasons, which `text` contains already.
     pub listed: Vec<String>,
+    /// Whether nothing in a capture determines if its poses are right.
+    pub poses_unchecked: bool,
 }
 
 impl Inspection {
@@ -151,6 +153,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     }
     if let Some(folder) = &options.doctor {
         check_apart(folder, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
+        check_no_capture(folder, &[])?;
         // Before the images are read, which takes a while.
         files::make_folder(folder)?;
         return doctor::of(&capture, folder, console);
@@ -163,6 +166,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     console.clear();
     let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, recipe), |o| o.memory);
     let checked = capture.check_poses();
+    let poses_unchecked = checked.finding.aspect == Some(Aspect::NotChecked);
     let written_as = checked.written_as.map(|p| p.to_string());
     let mut findings = capture.preflight();
     findings.push(checked.finding);
@@ -246,7 +250,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "about": f.aspect.map(Aspect::name), "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
-    Ok(Inspection { json, text, troubles, listed })
+    Ok(Inspection { json, text, troubles, listed, poses_unchecked })
 }
 
 /// A capture that is shipped as a video per camera with poses, whose frames are not extracted yet.
@@ -289,7 +293,7 @@ fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
         "moments": found.cameras.iter().filter_map(|(_, n)| *n).max(), "fps": found.rate, "cameras": names,
         "findings": findings.chain(notes).collect::<Vec<_>>(),
     });
-    Inspection { json, text, troubles: found.warnings.clone(), listed: Vec::new() }
+    Inspection { json, text, troubles: found.warnings.clone(), listed: Vec::new(), poses_unchecked: true }
 }
 
 /// The first and the last name of a list, and those between where there are few.
@@ -413,7 +417,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
         troubles.extend(inner.troubles);
         json["scene"] = inner.json;
     }
-    Ok(Inspection { json, text, troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false })
 }
 
 fn of_file(path: &Path) -> Result<Inspection> {
@@ -460,7 +464,7 @@ fn of_file(path: &Path) -> Result<Inspection> {
         json["type"] = json!("playback");
         json["playback"] = told.json;
     }
-    Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new(), poses_unchecked: false })
 }
 
 /// Names of edits, one after the other.
@@ -573,7 +577,7 @@ fn of_scene(scene: &Scene<f32>) -> Inspection {
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });
-    Inspection { json, text, troubles, listed: Vec::new() }
+    Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false }
 }
 
 fn bucket(edges: &[f64], value: f64) -> usize {
