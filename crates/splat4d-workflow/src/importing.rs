@@ -9,7 +9,7 @@ use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
 use splat4d_import::recording::{self, CameraReport, Report, Request};
 use splat4d_train::event::{Event, Progress};
-use splat4d_train::output::{Input, OutputFolder, check_apart, check_no_capture, written};
+use splat4d_train::output::{Input, OutputFolder, check_apart, written};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::fmt::Write;
@@ -57,12 +57,7 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     let read = request.inputs.iter().chain(&request.masks).map(|v| Input::new(v, "what is imported,"));
     // A capture may be next to the videos, in the folder of their calibration.
     let calibration = request.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
-    let inputs: Vec<Input<'_>> = read.chain(calibration).collect();
-    check_apart(folder, &inputs)?;
-    // An earlier import into this folder is a capture of its own.
-    let own = (is_ours(folder) || !written(folder).is_empty())
-        .then(|| Input { may_hold: true, ..Input::new(folder, "the import") });
-    check_no_capture(folder, &inputs.into_iter().chain(own).collect::<Vec<_>>())?;
+    check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
     // Before videos are read, which takes a while.
     request.calibration.iter().try_for_each(|c| calibration::read(c).map(drop))?;
     let _owned = OutputFolder::amend(folder, "import")?;
@@ -159,7 +154,7 @@ impl Imported {
 
 /// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never replaced.
 fn check_ours(folder: &Path) -> Result<()> {
-    if is_ours(folder) {
+    if folder.join(corrections::FILE).is_file() {
         return Ok(());
     }
     let listed = written(folder);
@@ -170,11 +165,6 @@ fn check_ours(folder: &Path) -> Result<()> {
         name => format!("holds {name}, and there is no record that splat4d wrote it"),
     };
     Err(Error::input(what).at(folder.display()).remedy("Give another folder with option `output`."))
-}
-
-/// Whether an import into a folder came as far as its list of corrections.
-fn is_ours(folder: &Path) -> bool {
-    folder.join(corrections::FILE).is_file()
 }
 
 fn row(camera: &CameraReport) -> String {

@@ -22,7 +22,7 @@ use splat4d::{Error, Result};
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::output::{Owner, check_apart, check_no_capture};
+use splat4d_train::output::{Owner, check_apart};
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::ChunkEstimate;
@@ -153,7 +153,6 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     }
     if let Some(folder) = &options.doctor {
         check_apart(folder, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
-        check_no_capture(folder, &[])?;
         // Before the images are read, which takes a while.
         files::make_folder(folder)?;
         return doctor::of(&capture, folder, console);

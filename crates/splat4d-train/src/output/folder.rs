@@ -3,7 +3,7 @@
 use super::cannot_write;
 use super::list::{self, List};
 use super::owner::{Owner, in_use};
-use super::place::{Input, check_apart, check_no_capture};
+use super::place::{Input, check_inputs, check_no_capture};
 use super::temporary::is_temporary;
 use super::{STATE, legacy, write_atomically};
 use crate::path_text::in_command;
@@ -91,7 +91,7 @@ impl OutputFolder {
     /// and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be written. Nothing
     /// is changed then.
     pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, FolderContent)> {
-        check_apart(path, request.inputs)?;
+        check_inputs(path, request.inputs)?;
         check_no_capture(path, request.inputs)?;
         if path.exists() && !path.is_dir() {
             return Err(Error::input("is a file").at(path.display()).remedy("Give the name of a folder."));

@@ -22,7 +22,7 @@ pub use date::rfc3339;
 pub use folder::{FolderContent, Mixes, OutputFolder, Request};
 pub use list::{note, written};
 pub use owner::{Owner, Standing, check_free};
-pub use place::{Input, check_apart, check_file, check_no_capture};
+pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};
 
 use crate::{Error, Result};

@@ -3,11 +3,14 @@
 //! Folders are compared by what the file system states they are (device and number), so that links, mounts, `..` and names
 //! that only differ in case are seen through.
 
-use super::STATE;
+use super::{STATE, written};
 use crate::capture;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
+/// Files of imports: the capture that they make, and their list of corrections.
+const CAPTURE: &str = "capture.json";
+const CORRECTIONS: &str = "import.toml";
 /// Folders below an output folder that are examined for captures, two levels deep.
 const MOST_FOLDERS: usize = 256;
 
@@ -29,9 +32,18 @@ impl<'a> Input<'a> {
     }
 }
 
+/// Refuses an output folder that equals, contains or is inside an input or any capture. An import may be continued in its
+/// own folder.
+pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
+    check_inputs(output, inputs)?;
+    let is_import = written(output).iter().any(|f| f == Path::new(CAPTURE)) || output.join(CORRECTIONS).is_file();
+    let own = is_import.then(|| Input { may_hold: true, ..Input::new(output, "the import") });
+    check_no_capture(output, &inputs.iter().copied().chain(own).collect::<Vec<_>>())
+}
+
 /// Refuses an output folder that equals, contains or is inside an input. Missing inputs are reported by
 /// their readers.
-pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
+pub(super) fn check_inputs(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     let above_output = ids(output);
     for input in inputs {
         let Ok(real) = input.path.canonicalize() else { continue };
@@ -56,7 +68,7 @@ pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
 
 /// Refuses an output folder that is any capture, contains one or is inside one: its images are the user's even if the command
 /// reads none of them. An input that may hold the output, or the folder of such a file, is none of these.
-pub fn check_no_capture(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
+pub(super) fn check_no_capture(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     let folder_of = |path: &Path| if path.is_dir() { id(path) } else { path.parent().and_then(id) };
     let holders: Vec<Option<Id>> = inputs.iter().filter(|i| i.may_hold).map(|i| folder_of(i.path)).collect();
     let is_foreign = |folder: &Path| capture::is_filmed(folder) && !holders.contains(&id(folder));
@@ -167,7 +179,7 @@ mod tests {
         let capture = at("capture");
         let check = |output: &Path, may_hold: bool| {
             let input = Input { may_hold, ..Input::new(&capture, "the capture") };
-            check_apart(output, &[input]).map_err(|e| e.to_string())
+            check_inputs(output, &[input]).map_err(|e| e.to_string())
         };
         let refused = |output: &Path, how: &str| {
             let text = check(output, false).unwrap_err();
@@ -194,7 +206,7 @@ mod tests {
             // The capture behind a link, the output at its real place.
             let link = at("link");
             let input = [Input::new(&link, "the capture")];
-            assert!(check_apart(&capture, &input).is_err() && check_apart(&at("capture/run"), &input).is_err());
+            assert!(check_inputs(&capture, &input).is_err() && check_inputs(&at("capture/run"), &input).is_err());
         }
         std::fs::write(capture.join("points.ply"), b"x").unwrap();
         let file = |output: &Path, may_hold: bool| {
@@ -205,7 +217,7 @@ mod tests {
         assert_eq!([file(&read, true), file(&capture.join("new.ply"), false)], [Ok(()), Ok(())]);
         let error = check_file(&read, &[Input::new(&capture.join("points.ply"), "the scene")]).unwrap_err().to_string();
         assert!(error.contains("the output is the scene"), "{error}");
-        assert!(check_apart(&at("x"), &[Input::new(&at("nowhere"), "the capture")]).is_ok(), "readers say that");
+        assert!(check_inputs(&at("x"), &[Input::new(&at("nowhere"), "the capture")]).is_ok(), "readers say that");
     }
 
     #[test]
@@ -225,6 +237,10 @@ mod tests {
             assert!(text.contains(&format!("the output folder {how} the capture")), "{name}: {text}");
         }
         assert_eq!([check("sets/runs"), check("sets/runs/a"), check("new")], [Ok(()), Ok(()), Ok(())]);
+        // An import is continued in its own folder.
+        assert!(check_apart(&at("sets/a"), &[]).is_err());
+        std::fs::write(at("sets/a/import.toml"), "").unwrap();
+        assert!(check_apart(&at("sets/a"), &[]).is_ok() && check("sets/a").is_err());
         // The folder of a calibration may hold what is imported with it.
         for calibration in ["sets/a", "sets/a/transforms.json"] {
             let path = at(calibration);

@@ -22,6 +22,8 @@ const MEANT: usize = 7;
 const HEADER_LINES: usize = 5;
 /// Other names of columns.
 const ALIASES: [(&str, &str); 3] = [("z", "alt"), ("altitude", "alt"), ("f35", "f")];
+/// Files of an ending that are looked into.
+const MOST_FILES: usize = 100;
 /// Endings of such files.
 const ENDINGS: [&str; 2] = ["csv", "txt"];
 /// Width of the film that lengths refer to, millimetres.
@@ -31,9 +33,12 @@ const HEAD: usize = 1024;
 const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 fn find(root: &Path) -> Option<PathBuf> {
-    let mut found: Vec<PathBuf> = rig::file_names(root).iter().map(|n| root.join(n)).filter(|p| is(p)).collect();
-    found.sort_by_key(|p| p.extension().is_none_or(|e| !e.eq_ignore_ascii_case(ENDINGS[0])));
-    found.into_iter().next()
+    let names = rig::file_names(root);
+    let of = |ending: &'static str| {
+        let ends = move |p: &PathBuf| p.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending));
+        names.iter().map(|n| root.join(n)).filter(ends).take(MOST_FILES)
+    };
+    ENDINGS.into_iter().flat_map(of).find(|p| is(p))
 }
 
 fn is(path: &Path) -> bool {
