@@ -303,7 +303,10 @@ impl Console {
         let words = left.unwrap_or_default();
         self.advance(name, done, total, &words, || match total {
             0 => format!("{name} ..."),
-            _ => format!("{name} {done}/{total}{}{words}", if words.is_empty() { "" } else { ", " }),
+            _ => {
+                let comma = if words.is_empty() { "" } else { ", " };
+                format!("{name} {}/{}{comma}{words}", grouped(done), grouped(total))
+            }
         });
     }
 

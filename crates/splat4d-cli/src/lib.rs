@@ -159,14 +159,24 @@ pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
 /// would print, or the error.
 pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     let name = OsString::from("splat4d");
-    let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| {
-        let text = e.to_string();
-        Error::input(text.trim_start_matches("error: ").trim_end().to_owned())
-    })?;
+    let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| Error::input(without_usage(&e)))?;
     interrupt::embedded();
     let console = Console::keeping_objects();
     cli.verb.run(&console)?;
     Ok(console.into_objects())
+}
+
+/// What is wrong with the words, without the usage of the command line, which other programs do not show.
+fn without_usage(error: &clap::Error) -> String {
+    let text = error.to_string();
+    if !error.use_stderr() {
+        // It is the help that was asked for.
+        return text.trim_end().to_owned();
+    }
+    let lines =
+        text.lines().map(str::trim).take_while(|l| !l.starts_with("Usage:") && !l.starts_with("For more information"));
+    let lines: Vec<&str> = lines.filter(|l| !l.is_empty()).collect();
+    lines.join("; ").trim_start_matches("error: ").to_owned()
 }
 
 /// Parses the arguments of a program with the command's manners, does what `work` makes of them, and prints errors.
@@ -264,6 +274,25 @@ mod tests {
         let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
         let text = error_text(&error);
         assert!(text.starts_with("the report: ") && text.matches("disk on fire").count() == 1, "{text}");
+    }
+
+    #[test]
+    fn other_programs_get_errors_without_usage() {
+        let told = |words: &[&str]| {
+            let words: Vec<OsString> = words.iter().map(OsString::from).collect();
+            call(&words).unwrap_err().to_string()
+        };
+        for (words, what) in [
+            (&["train", "x", "--iteratons", "5"][..], "--iteratons"),
+            (&["train", "x", "--minutes", "soon"], "soon"),
+            (&["fly"], "fly"),
+            (&["bake", "x"], "required"),
+        ] {
+            let text = told(words);
+            let plain = !text.contains("Usage") && !text.contains("--help") && !text.contains('\n');
+            assert!(text.contains(what) && plain && !text.starts_with("error"), "{text}");
+        }
+        assert!(told(&["bake", "--help"]).contains("Usage"));
     }
 
     #[test]

@@ -93,12 +93,21 @@ fn write_all(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path, written: &m
     }
     if let Some(points) = arrays.points {
         let cloud = cloud(points, arrays.colors)?;
-        let path = folder.join("points.ply");
+        let path = free(folder.join("points.ply"))?;
         write_atomically(&path, &cloud.to_ply("comment from arrays")).or_raise()?;
         written.push(path);
         top["points"] = json!("points.ply");
     }
     write_atomically(&folder.join("capture.json"), format!("{top:#}\n").as_bytes()).or_raise()
+}
+
+/// The path, where nothing is there yet.
+fn free(path: PathBuf) -> PyResult<PathBuf> {
+    if std::fs::symlink_metadata(&path).is_ok() {
+        let what = format!("{} exists already", path.display());
+        return Err(bad_input(what, "Give a folder without images and points"));
+    }
+    Ok(path)
 }
 
 /// One camera as the caller gave it.
@@ -144,7 +153,7 @@ impl Filmed<'_, '_> {
         let files: Vec<String> = (0..images.len()).map(|k| format!("images/{name}/{k:06}.png")).collect();
         for (k, image) in images.iter().enumerate() {
             let samples = samples(image, &format!("images[{number}][{k}]"), first)?;
-            let path = folder.join(&files[k]);
+            let path = free(folder.join(&files[k]))?;
             py.detach(|| store(&samples, first, &path)).or_raise()?;
             written.push(path);
         }

@@ -115,6 +115,11 @@ class Errors(InFolder):
         refuses("expected Camera objects", [[picture]], [["camera"]], times=[0.0])
         refuses(r"images\[1\]\[0\]", [[picture], [picture + 2]], [camera, camera], times=[0.0])
         self.assertEqual(list(self.folder.rglob("*")), [], "nothing of it is left")
+        mine = self.folder / "images/cam00/000000.png"
+        mine.parent.mkdir(parents=True)
+        mine.write_bytes(b"mine")
+        refuses("exists already", [[picture]], times=[0.0])
+        self.assertEqual(mine.read_bytes(), b"mine")
         before = set(pathlib.Path("/tmp").glob("tmp*")) if pathlib.Path("/tmp").is_dir() else set()
         self.refuses("no times", splat4d.Capture.from_arrays, [[picture, picture]], [camera])
         gc.collect()
@@ -198,5 +203,8 @@ class Errors(InFolder):
 
     def test_words_of_the_command(self):
         self.refuses("unrecognized subcommand", splat4d.command, "paint")
+        with self.assertRaisesRegex(splat4d.Error, "--fast") as caught:
+            splat4d.command("bake", "x", "--fast")
+        self.assertNotIn("Usage", str(caught.exception))
         with self.assertRaisesRegex(splat4d.Error, "nowhere"):
             splat4d.command("bake", "nowhere", "-o", self.folder / "x.s4d")

@@ -145,11 +145,6 @@ export function combined(old, text, how) {
   return { add: `${old} or ${text}`, remove: `${all(old)} and not ${all(text)}`, within: `${all(old)} and ${all(text)}` }[how];
 }
 
-const NAMES = { delete: 'Delete', crop: 'Keep only', hide: 'Hide', recolor: 'Colour', opacity: 'Opacity', move: 'Move',
-  duplicate: 'Duplicate', split: 'Split off', cut: 'Cut', retime: 'Retime', merge: 'Merge', drag: 'Bend',
-  floaters: 'Floaters' };
-export const nameOf = step => NAMES[step.do] ?? step.do;
-
 /** What can be replayed: a bend that nothing pulls yet is left out. */
 export const ready = steps => steps.filter(s => s.do !== 'drag' || s.handles.length);
 

@@ -1,7 +1,7 @@
 // Editing: a panel over the player, and its requests to the program that serves the page. The list of edits is the
 // page's; the program replays it, and only it can change a scene: nothing here touches a Gaussian.
 
-import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
+import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, placeAt, pulledAt, pulledTo, quatOf,
   ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
 import { Overlay } from './edit-tools.js';
 import { allow, button, choice, clock, field, h, segments, tool } from './dom.js';
@@ -15,6 +15,12 @@ const REST = 180;
 const NODES = 512;
 /** Radius of a handle, of the selection's spread: some nodes around the one that is taken. */
 const GRIP = 0.12;
+
+/** Steps, as they are shown; what the page offers of each is in this file. */
+const NAMES = { delete: 'Delete', crop: 'Keep only', hide: 'Hide', recolor: 'Colour', opacity: 'Opacity', move: 'Move',
+  duplicate: 'Duplicate', split: 'Split off', cut: 'Cut', retime: 'Retime', merge: 'Merge', drag: 'Bend',
+  floaters: 'Floaters' };
+const nameOf = step => NAMES[step.do] ?? step.do;
 
 const TOOLS = [['', 'Look'], ['box', 'Box'], ['sphere', 'Sphere'], ['lasso', 'Lasso'], ['color', 'Colour']];
 const HOW = [['new', 'New'], ['add', 'Add'], ['remove', 'Remove'], ['within', 'Within']];

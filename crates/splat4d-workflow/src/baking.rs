@@ -250,9 +250,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
     }
     let source = Source::open(from)?;
     not_empty(&source.scene, from)?;
-    for file in std::iter::once(out).chain(report) {
-        source.keep(from, file, &[])?;
-    }
+    source.keep_all(from, &std::iter::once(out).chain(report).collect::<Vec<_>>(), &[])?;
     let value = bake_into(&source, &title(&source, from), out, baking, listener)?;
     if let Some(path) = report {
         files::write(path, format!("{value:#}").as_bytes())?;

@@ -112,7 +112,8 @@ pub fn join(
     let joined = chunked.join()?;
     let Joined { chunks, gaussians, seconds, peak_memory, .. } = joined;
     console.result(&format!(
-        "{chunks} chunks, {gaussians} Gaussians, {:.1} minutes of training, {} at most in a part",
+        "{chunks} chunks, {} Gaussians, {:.1} minutes of training, {} at most in a part",
+        grouped(gaussians),
         seconds / 60.0,
         human_bytes(peak_memory)
     ));

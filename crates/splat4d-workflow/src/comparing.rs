@@ -1,5 +1,6 @@
 //! Runs and results of other programs next to each other: what is compared, and whether it can be.
 
+use crate::files::grouped;
 use crate::run_folder::{Metrics, Run, ViewScore, newest, view_scores};
 use serde_json::Value;
 use splat4d::{Error, Result};
@@ -184,7 +185,16 @@ pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
 
 /// The table as text: a head, and cells by row; columns that no row has are left out.
 pub fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
-    let number = |n: Option<usize>| n.map(|n| n.to_string()).unwrap_or_default();
+    table_of(entries, |n| n.to_string())
+}
+
+/// [`table`] for people: counts with separators of thousands.
+pub fn table_to_read(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
+    table_of(entries, grouped)
+}
+
+fn table_of(entries: &[Entry], written: fn(usize) -> String) -> (Vec<String>, Vec<Vec<String>>) {
+    let number = |n: Option<usize>| n.map(written).unwrap_or_default();
     let mut columns: Vec<(String, Vec<String>)> = vec![
         (WORDS[0].into(), entries.iter().map(|e| e.name.clone()).collect()),
         (WORDS[1].into(), entries.iter().map(|e| e.motion.clone().unwrap_or_default()).collect()),
@@ -229,6 +239,7 @@ mod tests {
         assert_eq!(names, ["gs", "ns", "gs (2)"]);
         let (head, rows) = table(&entries);
         assert_eq!(head, ["run", "steps", "PSNR", "SSIM", "LPIPS"]);
+        assert_eq!([&rows[0][1], &table_to_read(&entries).1[0][1]], ["30000", "30,000"]);
         assert_eq!(rows[0], ["gs", "30000", "27.25", "0.8000", ""]);
         assert_eq!(rows[1], ["ns", "", "26.50", "", "0.2000"]);
         assert_eq!(best(&entries)[..5], [Some(0), None, None, Some(0), None], "one row alone is not the best");

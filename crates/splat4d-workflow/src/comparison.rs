@@ -56,7 +56,8 @@ pub fn compare(runs: &[PathBuf], outputs: &[PathBuf], console: &dyn Listener) ->
         console.warn(&format!("{difference}: their scores cannot be compared."));
     }
     let (head, rows) = comparing::table(&entries);
-    text(&head, &rows).iter().for_each(|line| console.result(line));
+    let (_, to_read) = comparing::table_to_read(&entries);
+    text(&head, &to_read).iter().for_each(|line| console.result(line));
     console.emit(&objects(&entries));
     for (output, form) in outputs.iter().zip(forms) {
         let bytes = match form {
@@ -106,7 +107,7 @@ fn csv(head: &[String], rows: &[Vec<String>]) -> Result<Vec<u8>> {
 
 /// A table whose best scores are bold.
 fn markdown(entries: &[Entry]) -> String {
-    let ((head, rows), best) = (comparing::table(entries), comparing::best(entries));
+    let ((head, rows), best) = (comparing::table_to_read(entries), comparing::best(entries));
     let safe = |text: &str| splat4d::text::in_line(text).replace('|', "\\|");
     let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
     let mut out = line(head.iter().map(|h| safe(h)).collect());

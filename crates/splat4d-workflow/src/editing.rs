@@ -24,7 +24,7 @@ use splat4d_train::output::rfc3339;
 use splat4d_train::run::available_memory;
 use splat4d_train::run::dataset::Dataset;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
 
 /// Masks of images that are examined for the subject, at most: each costs one pass over the whole scene.
@@ -91,8 +91,10 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
     not_empty(&source.scene, &options.scene)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     let listed: Vec<&Path> = options.list.iter().map(PathBuf::as_path).collect();
+    let outputs: Vec<&Path> = options.output.iter().chain(&options.save).map(PathBuf::as_path).collect();
+    source.keep_all(&options.scene, &outputs, &[])?;
     for file in options.output.iter().chain(&options.save) {
-        // A list may be saved with more steps in its own place.
+        // A list may be saved with further steps in its own place.
         let others = if options.save.as_ref() == Some(file) { &[] } else { &listed[..] };
         source.keep(&options.scene, file, others)?;
     }
@@ -107,6 +109,8 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
         console.phase("editing", done, all);
     })?;
     console.clear();
+    let read = bring.read();
+    source.keep_all(&options.scene, &outputs, &read.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
     for step in &done {
         console.result(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
     }
@@ -157,12 +161,26 @@ pub struct Bring<'a> {
     folder: PathBuf,
     views: Vec<View>,
     console: &'a dyn Listener,
+    /// Masks and scenes that steps have named.
+    read: Mutex<Vec<PathBuf>>,
 }
 
 impl<'a> Bring<'a> {
     pub fn new(source: &'a Source, edits: Option<&Path>, console: &'a dyn Listener) -> Result<Self> {
         let folder = edits.and_then(Path::parent).map(Path::to_owned).unwrap_or_default();
-        Ok(Self { source, folder, views: source.views()?, console })
+        Ok(Self { source, folder, views: source.views()?, console, read: Mutex::default() })
+    }
+
+    /// The file of that name, which is read.
+    fn file(&self, name: &str) -> PathBuf {
+        let path = self.folder.join(name);
+        self.read.lock().unwrap_or_else(PoisonError::into_inner).push(path.clone());
+        path
+    }
+
+    /// The files that steps have named so far.
+    fn read(&self) -> Vec<PathBuf> {
+        self.read.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     fn capture(&self) -> Result<(Arc<Capture>, Dataset, bool)> {
@@ -198,7 +216,7 @@ impl Context for Bring<'_> {
     }
 
     fn mask(&self, name: &str, camera: &Camera) -> Result<Mask> {
-        let path = self.folder.join(name);
+        let path = self.file(name);
         let unread = |e: image::ImageError| {
             Error::input(format!("the image cannot be read ({e})")).at(path.display()).remedy("Give a PNG.")
         };
@@ -237,7 +255,7 @@ impl Context for Bring<'_> {
     }
 
     fn scene(&self, name: &str) -> Result<Scene<f32>> {
-        Ok(Source::open(&self.folder.join(name))?.scene)
+        Ok(Source::open(&self.file(name))?.scene)
     }
 
     fn memory(&self) -> Option<u64> {

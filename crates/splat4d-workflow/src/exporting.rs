@@ -7,7 +7,7 @@ use crate::playable::Playable;
 use crate::point_queries::{self, QueryResult};
 use crate::run_folder::Run;
 use crate::sequence;
-use crate::source::{Source, keep, not_empty};
+use crate::source::{Source, keep_all, not_empty};
 use serde_json::json;
 use splat4d::flow::tracks::{Tracks, every, nearest};
 use splat4d::layers::{Scene, freeze};
@@ -210,7 +210,6 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
             .remedy("Use option `output` NAME.html."));
     }
     let run = Run::is(path).then(|| Run::open(path)).transpose()?;
-    keep(path, run.as_ref(), out, &[])?;
     if let Some(link) = link.filter(|link| !files::is_playback(link)) {
         return Err(Error::input("the name does not end in .s4d")
             .at(link.display())
@@ -218,9 +217,8 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
     }
     // A playback file may be next to its page unchanged.
     let is_read = |link: &&Path| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
-    if let Some(link) = link.filter(|link| !is_read(link)) {
-        keep(path, run.as_ref(), link, &[])?;
-    }
+    let outputs: Vec<&Path> = std::iter::once(out).chain(link.filter(|link| !is_read(link))).collect();
+    keep_all(path, run.as_ref(), &outputs, &[])?;
     let address = link.map(|link| address(link, out)).transpose()?;
     let scene = Playable::open(path, listener)?;
     let bytes = scene.bytes()?;

@@ -82,6 +82,8 @@ pub struct Inspection {
     pub troubles: Vec<String>,
     /// More reasons, which `text` contains already.
     pub listed: Vec<String>,
+    /// Whether nothing in a capture determines if its poses are right.
+    pub poses_unchecked: bool,
 }
 
 impl Inspection {
@@ -163,6 +165,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     console.clear();
     let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, recipe), |o| o.memory);
     let checked = capture.check_poses();
+    let poses_unchecked = checked.finding.aspect == Some(Aspect::NotChecked);
     let written_as = checked.written_as.map(|p| p.to_string());
     let mut findings = capture.preflight();
     findings.push(checked.finding);
@@ -246,7 +249,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "about": f.aspect.map(Aspect::name), "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
-    Ok(Inspection { json, text, troubles, listed })
+    Ok(Inspection { json, text, troubles, listed, poses_unchecked })
 }
 
 /// A capture that is shipped as a video per camera with poses, whose frames are not extracted yet.
@@ -289,7 +292,7 @@ fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
         "moments": found.cameras.iter().filter_map(|(_, n)| *n).max(), "fps": found.rate, "cameras": names,
         "findings": findings.chain(notes).collect::<Vec<_>>(),
     });
-    Inspection { json, text, troubles: found.warnings.clone(), listed: Vec::new() }
+    Inspection { json, text, troubles: found.warnings.clone(), listed: Vec::new(), poses_unchecked: true }
 }
 
 /// The first and the last name of a list, and those between where there are few.
@@ -413,7 +416,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
         troubles.extend(inner.troubles);
         json["scene"] = inner.json;
     }
-    Ok(Inspection { json, text, troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false })
 }
 
 fn of_file(path: &Path) -> Result<Inspection> {
@@ -460,7 +463,7 @@ fn of_file(path: &Path) -> Result<Inspection> {
         json["type"] = json!("playback");
         json["playback"] = told.json;
     }
-    Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new(), poses_unchecked: false })
 }
 
 /// Names of edits, one after the other.
@@ -573,7 +576,7 @@ fn of_scene(scene: &Scene<f32>) -> Inspection {
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });
-    Inspection { json, text, troubles, listed: Vec::new() }
+    Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false }
 }
 
 fn bucket(edges: &[f64], value: f64) -> usize {

@@ -88,7 +88,8 @@ impl Default for RenderOptions {
 ///
 /// Errors: no output; a scene or camera that cannot be read; raw values that do not fit the channel.
 pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Listener) -> Result<()> {
-    let (camera, background) = camera_file::read(camera)?;
+    let camera_file = camera;
+    let (camera, background) = camera_file::read(camera_file)?;
     let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
         return Err(
             Error::input("no output was given").remedy("Add option `output` NAME.png, option `raw` NAME or both.")
@@ -102,9 +103,8 @@ pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Lis
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
     let raw = args.raw.as_deref().map(|prefix| raw_files(prefix, args)).unwrap_or_default();
-    for file in args.output.iter().chain(&raw) {
-        source.keep(path, file, &[])?;
-    }
+    let outputs: Vec<&Path> = args.output.iter().chain(&raw).map(PathBuf::as_path).collect();
+    source.keep_all(path, &outputs, &[camera_file])?;
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.or(background).unwrap_or(source.scene.background);
     let painter = Painter::new(&source.scene, background, antialias(&source), depth);
@@ -231,7 +231,8 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     let stage = source.stage(&views);
     let shots = shots(&route, &clock, &views, &stage, args.size)?;
     let output = args.output.clone().unwrap_or_else(|| default_output(path, &route, source.run.is_some()));
-    source.keep(path, &output, &[])?;
+    let keys = if let Route::Keys(file) = &route { vec![file.as_path()] } else { Vec::new() };
+    source.keep(path, &output, &keys)?;
     let size = [shots[0].camera.width, shots[0].camera.height];
     if let Some(other) = shots.iter().find(|s| [s.camera.width, s.camera.height] != size)
         && output.extension().is_some()

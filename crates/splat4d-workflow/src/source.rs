@@ -65,6 +65,23 @@ pub fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> 
     Ok(())
 }
 
+/// [`keep`] of all files that a command writes, which also must not replace each other.
+pub fn keep_all(path: &Path, run: Option<&Run>, outputs: &[&Path], others: &[&Path]) -> Result<()> {
+    let place = |file: &Path| {
+        let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        (folder.canonicalize().or_else(|_| std::path::absolute(folder)).ok(), file.file_name().map(ToOwned::to_owned))
+    };
+    for (i, output) in outputs.iter().enumerate() {
+        keep(path, run, output, others)?;
+        if !output.starts_with("/dev") && outputs[..i].iter().any(|before| place(before) == place(output)) {
+            return Err(Error::input("two outputs have the same name")
+                .at(output.display())
+                .remedy("Give each a name of its own."));
+        }
+    }
+    Ok(())
+}
+
 impl Source {
     /// Opens a run, a file or a sequence.
     pub fn open(path: &Path) -> Result<Self> {
@@ -150,7 +167,12 @@ impl Source {
 
     /// Refuses an output that would replace what was read.
     pub fn keep(&self, path: &Path, output: &Path, others: &[&Path]) -> Result<()> {
-        keep(path, self.run.as_ref(), output, others)
+        self.keep_all(path, &[output], others)
+    }
+
+    /// The same of several outputs, which also must not replace each other.
+    pub fn keep_all(&self, path: &Path, outputs: &[&Path], others: &[&Path]) -> Result<()> {
+        keep_all(path, self.run.as_ref(), outputs, others)
     }
 
     /// The data set's cameras; those that a playback file brings along; empty for other bare files.

@@ -74,13 +74,18 @@ const ADDITIONS: [(&str, &[&str], &[&str]); 4] = [
         &["panoptic", "Panoptic"],
         &["crates/splat4d-train/src/capture/mod.rs", "crates/splat4d-train/src/capture/panoptic.rs"],
     ),
-    ("step of edits", &["Recolor", "recolor"], &["crates/splat4d/src/edit/act.rs", "crates/splat4d/src/edit/mod.rs"]),
+    (
+        "step of edits",
+        &["Recolor", "recolor"],
+        &["crates/splat4d/src/edit/act.rs", "crates/splat4d/src/edit/mod.rs", "crates/splat4d-serve/player/edit.js"],
+    ),
 ];
 
 #[test]
 fn an_addition_touches_few_files() {
+    let player = files("crates/splat4d-serve/player", "js");
     let sources: Vec<String> =
-        files("crates", "rs").into_iter().filter(|f| f.contains("/src/") && !is_test(f)).collect();
+        files("crates", "rs").into_iter().filter(|f| f.contains("/src/") && !is_test(f)).chain(player).collect();
     let names = |file: &str, words: &[&str]| {
         code(&read(file)).iter().any(|(_, line)| line.split(|c| !is_word(c)).any(|w| words.contains(&w)))
     };

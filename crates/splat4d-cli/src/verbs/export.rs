@@ -6,7 +6,7 @@ use serde_json::json;
 use splat4d::Error;
 use splat4d_workflow::exporting::{self, Frames, TrackOptions};
 use splat4d_workflow::files;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -130,9 +130,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
     let source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
-    for file in args.output.iter().chain(&args.tracks) {
-        source.keep(path, file, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
-    }
+    let outputs: Vec<&Path> = args.output.iter().chain(&args.tracks).map(PathBuf::as_path).collect();
+    source.keep_all(path, &outputs, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
     let scene = &source.scene;
     let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {

@@ -131,6 +131,7 @@ fn no_output_replaces_an_input() {
         &["bake", str(&ply), "-o", str(&at("a.s4d")), "--report", str(&ply)],
         &["edit", str(&ply), "--crop", "all", "-o", str(&ply)],
         &["edit", str(&ply), "--crop", "all", "--save", str(&ply), "-o", str(&at("b.ply"))],
+        &["bake", str(&ply), "-o", str(&at("a.s4d")), "--report", str(&at("frames/../a.s4d"))],
         &["export", str(&ply), "-o", str(&page), "--link", str(&ply)],
         &["export", str(&ply), "-o", str(&ply)],
     ] {
@@ -141,6 +142,15 @@ fn no_output_replaces_an_input() {
     splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
     assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
     splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
+    // A scene that an edit merges is read too.
+    let (list, other) = (at("list.toml"), at("other.s4d"));
+    splat4d(&["bake", str(&ply), "-o", str(&other)]).run().ok();
+    let before = std::fs::read(&other).unwrap();
+    let merge = "[[edit]]\ndo = \"merge\"\nscene = \"other.s4d\"\nname = \"second\"\nat = 0.0\n";
+    std::fs::write(&list, merge).unwrap();
+    let said = splat4d(&["edit", str(&ply), str(&list), "-o", str(&other)]).run().refused();
+    assert!(said.contains("the output is what is read") && std::fs::read(&other).unwrap() == before, "{said}");
+    splat4d(&["edit", str(&ply), str(&list), "-o", str(&at("merged.s4d"))]).run().ok();
     // Images that the capture holds by a link are as much its own.
     #[cfg(unix)]
     {
@@ -242,6 +252,55 @@ fn no_output_replaces_external_files_of_a_capture() {
         let said = splat4d(&["convert", str(&at(read)), str(&frames), "--frames"]).run().refused();
         assert!(said.contains("what is read"), "{said}");
     }
+}
+
+/// A capture that the command does not read is as safe as one that it reads.
+#[test]
+fn no_folder_is_written_into_any_capture() {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    let capture = Capture::new(&at("sets")).write();
+    // Another program's: COLMAP's text with photos, and videos with their poses.
+    let others =
+        ["colmap/cameras.txt", "colmap/images.txt", "colmap/images/a.jpg", "n3dv/poses_bounds.npy", "n3dv/cam00.mp4"];
+    for name in others {
+        std::fs::create_dir_all(at(name).parent().unwrap()).unwrap();
+        std::fs::write(at(name), name).unwrap();
+    }
+    let before = count(work.path());
+    write_ply(&at("a.ply"), 0.0);
+    let (file, own) = (at("a.ply"), Capture::new(&at("own")).write());
+    let refused = |words: &[&str], out: &Path, how: &str| {
+        let said = splat4d(words).paths(&[out]).run().refused();
+        assert!(said.contains(how) && said.contains("the capture") && said.contains("-o"), "{words:?}: {said}");
+    };
+    for (out, how) in [
+        (capture.clone(), "is the capture"),
+        (capture.join("images/cam0"), "lies inside the capture"),
+        (capture.join("new"), "lies inside the capture"),
+        (at("colmap"), "is the capture"),
+        (at("colmap/images"), "lies inside the capture"),
+        (at("n3dv/frames"), "lies inside the capture"),
+        (at("sets"), "contains the capture"),
+        (work.path().to_owned(), "contains the capture"),
+    ] {
+        refused(&["convert", "--force", "--frames", str(&file)], &out, how);
+        refused(&["export", str(&file), "--force", "--sequence"], &out, how);
+        refused(&["render", str(&file), "--force", "--path", "orbit", "-o"], &out, how);
+        refused(&[&["train", str(&own), "--force"][..], &TINY[..], &["-o"][..]].concat(), &out, how);
+        if out != work.path() {
+            // That folder contains the scene, too.
+            refused(&["eval", str(&file), "--capture", str(&own), "--force", "-o"], &out, how);
+        }
+        refused(&["info", str(&own), "--doctor", "-o"], &out, how);
+    }
+    refused(&["import", str(&at("n3dv/cam00.mp4")), "-o"], &capture.join("take"), "lies inside the capture");
+    assert_eq!((count(&at("sets")) + others.len(), count(&at("n3dv"))), (before, 2));
+    // The folder of captures holds runs too, and a file is no folder.
+    let run = at("runs/own");
+    splat4d(&["train", str(&own), "--no-eval", "-o", str(&run)]).args(&TINY).run().ok();
+    refused(&["compress", "--force", str(&run), "-o"], &capture.join("small"), "lies inside the capture");
+    splat4d(&["convert", str(&file), str(&capture.join("initial.ply"))]).run().ok();
 }
 
 #[test]

@@ -36,13 +36,17 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     skip_missing(&mut take, options).map_err(located)?;
     skip_repeated(&mut take);
     masks::fill(&mut take)?;
+    let in_part = take.take != Extent::default();
+    if !in_part {
+        drop_unused_cameras(&mut take, &used);
+    }
+    shared_images(&mut take);
+    // The faces of a panorama are cameras of their own, and share its image.
     panorama::split(&mut take, options.hold_out.as_ref())?;
     for frame in &mut take.frames {
         check_frame(frame, &take.cameras[frame.camera], options)?;
     }
-    let in_part = take.take != Extent::default();
     if !in_part {
-        drop_unused_cameras(&mut take, &used);
         let mut all = Extent::default();
         take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
         take.take = all;
@@ -51,7 +55,6 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
-    shared_images(&mut take);
     if take.points.is_none() && !in_part {
         unread_clouds(&mut take);
     }

@@ -12,7 +12,7 @@ use super::account::{Account, Aspect};
 use super::colmap_files::{self, Point, Registered};
 use super::convention::{Convention, Poses};
 use super::lookup::{self, Lookup};
-use super::points::read_ply;
+use super::points::read_cloud;
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, extra_model, rig, sequence};
 use splat4d::math::{Se3, quat};
@@ -116,7 +116,9 @@ fn capture_folder(models: &Path) -> PathBuf {
         let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let of_models = MODEL_FOLDERS.iter().any(|n| name.eq_ignore_ascii_case(n)) || name.parse::<u32>().is_ok();
         if folder != models && !of_models {
-            return folder;
+            // A folder of results next to the images, such as `output/sparse/0`.
+            let above = folder.parent().filter(|p| !p.as_os_str().is_empty() && has_images(p));
+            return above.map_or(folder.clone(), Path::to_path_buf);
         }
         folder = match folder.parent() {
             Some(above) if !above.as_os_str().is_empty() => above.to_path_buf(),
@@ -209,11 +211,17 @@ fn has_cameras(folder: &Path) -> bool {
     rig::has_any(folder, &["cameras.bin", "cameras.txt"])
 }
 
-/// The model folder (`sparse` itself or a numbered one in it) with the most registered images.
+/// The model folder (`sparse` itself, or one in it: a numbered one, else one of any name) with the most registered images.
 fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec<Registered>)> {
+    let (numbered, named): (Vec<String>, Vec<String>) =
+        rig::file_names(sparse).into_iter().partition(|n| n.parse::<u32>().is_ok());
     let mut candidates = vec![sparse.to_path_buf()];
-    candidates.extend(rig::file_names(sparse).iter().filter(|n| n.parse::<u32>().is_ok()).map(|n| sparse.join(n)));
+    candidates.extend(numbered.iter().map(|n| sparse.join(n)));
     candidates.retain(|c| has_cameras(c));
+    let split = !candidates.is_empty();
+    if candidates.is_empty() {
+        candidates.extend(named.iter().map(|n| sparse.join(n)).filter(|c| has_cameras(c)));
+    }
     let mut models = Vec::new();
     for folder in candidates {
         let images = colmap_files::images(&folder)?;
@@ -227,8 +235,9 @@ fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec
             .remedy("Point to a finished COLMAP reconstruction (sparse/0).")
     })?;
     if count > 1 {
+        let what = if split { "COLMAP split the images into" } else { "There are" };
         warnings.push(format!(
-            "COLMAP split the images into {count} separate models; {} is used ({} images).",
+            "{what} {count} separate models; {} is used ({} images). To read another, give its path.",
             best.0.display(),
             best.1.len()
         ));
@@ -300,7 +309,7 @@ fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(Po
 fn cloud_of(points: &[Point], model: &Path) -> Result<Option<PointCloud>> {
     let ply = model.join(POINTS);
     match cloud(points) {
-        None if ply.is_file() => read_ply(&ply).map(Some),
+        None if ply.is_file() => read_cloud(&ply).map(Some),
         cloud => Ok(cloud),
     }
 }

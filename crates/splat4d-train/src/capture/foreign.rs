@@ -10,7 +10,7 @@ mod tests;
 
 use super::convention::{Convention, Poses};
 use super::lookup::Twins;
-use super::points::read_ply;
+use super::points::read_cloud;
 use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawCapture, RawFrame, Timing, rig, sequence};
 use super::{lookup, pose};
 use splat4d::math::Se3;
@@ -190,7 +190,7 @@ fn only_points(root: &Path, notes: &mut Vec<String>) -> Result<Option<PointCloud
         [] => Ok(None),
         [one] => {
             notes.push(format!("The initial points are those of {one}."));
-            read_ply(&root.join(one)).map(Some)
+            read_cloud(&root.join(one)).map(Some)
         }
         several => {
             notes.push(format!(

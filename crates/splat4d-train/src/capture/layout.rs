@@ -2,6 +2,7 @@
 //! where there
 //! is none.
 
+use super::account::first_names;
 use super::{
     CaptureOptions, READERS, RawCapture, Reader, colmap, foreign, llff, n3dv, nerfies, rig, stray, transforms,
 };
@@ -28,8 +29,11 @@ const MODEL_FILES: [&str; 4] = ["images.bin", "images.txt", "points3D.bin", "poi
 pub(super) const BOUNDS: &str = "poses_bounds.npy";
 
 /// Markers of layouts that this version does not read, and what to do.
-const FOREIGN: &[(&str, &str)] =
-    &[("reconstruction.json", "OpenSfM reconstructions"), ("sfm_data.json", "OpenMVG reconstructions")];
+const FOREIGN: &[(&str, &str)] = &[
+    ("reconstruction.json", "OpenSfM reconstructions"),
+    ("sfm_data.json", "OpenMVG reconstructions"),
+    ("bundle.out", "Bundler reconstructions"),
+];
 
 /// Reads the capture in a folder, or that of a marker file or of a COLMAP model's folder.
 pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<RawCapture> {
@@ -172,11 +176,17 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
                 .remedy("Export the poses as COLMAP or Nerfstudio, or write a capture.json (docs/capture-format.md).");
         }
     }
-    let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
-    Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display()).remedy(
-        stray::advice(root, named, &is_capture).unwrap_or_else(|| {
-            "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout."
-                .into()
-        }),
-    )
+    let advice = stray::advice(root, named, &is_capture).unwrap_or_else(|| {
+        let names: Vec<String> = rig::file_names(root).into_iter().filter(|n| !n.starts_with('.')).collect();
+        let holds = match &names[..] {
+            _ if named.is_file() => String::new(),
+            [] => "It is empty. ".to_owned(),
+            _ => format!("It holds {}. ", first_names(&names)),
+        };
+        format!(
+            "{holds}Give the folder with the images and their poses, or write a capture.json (docs/capture-format.md)."
+        )
+    });
+    let what = "is not a capture: it has no capture.json, transforms.json, COLMAP model (sparse/0) or other layout (docs/layouts.md)";
+    Error::input(what).at(named.display()).remedy(advice)
 }

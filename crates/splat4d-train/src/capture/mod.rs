@@ -464,7 +464,14 @@ pub fn is_folder(path: &Path) -> bool {
     path.is_dir() && layout::is_capture(path)
 }
 
-/// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
+/// Whether a folder holds a capture and images or videos that were filmed for it. It is opened only where these do not lie in
+/// their usual places.
+pub(crate) fn is_filmed(path: &Path) -> bool {
+    let usual = || colmap::has_images(path) || !stray::videos(path).is_empty();
+    is_folder(path) && (usual() || Capture::open(path, &CaptureOptions::default()).is_ok())
+}
+
+/// A coloured point cloud from a .ply, .npy or .npz file. Errors: not a point cloud, damage, absurd counts.
 pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {
-    points::read_ply(path)
+    points::read_cloud(path)
 }

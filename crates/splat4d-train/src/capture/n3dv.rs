@@ -4,7 +4,7 @@ use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::lookup::Twins;
-use super::points::read_ply;
+use super::points::read_cloud;
 use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split};
 use super::{json, lookup, picture, pose, rig, sequence};
@@ -54,7 +54,7 @@ pub(super) fn rows(marker: &Path) -> Result<Vec<Vec<f64>>> {
 
 /// The cloud that prepared data sets keep next to the poses.
 pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
-    POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file()).map(|p| read_ply(&p)).transpose()
+    POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file()).map(|p| read_cloud(&p)).transpose()
 }
 
 /// Reads poses and frame folders; the first camera is held out.

@@ -4,7 +4,7 @@ use super::account::Account;
 use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::Lookup;
-use super::points::read_ply;
+use super::points::read_cloud;
 use super::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawCapture, RawFrame, Tracks, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -128,7 +128,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
         named: true,
         hold_out,
         fps,
-        points: points.as_deref().map(read_ply).transpose()?,
+        points: points.as_deref().map(read_cloud).transpose()?,
         files: points.into_iter().collect(),
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,

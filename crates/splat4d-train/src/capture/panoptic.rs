@@ -5,13 +5,12 @@ use super::account::{Account, Aspect, Severity};
 use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::{self, Lookup};
-use super::points::{read_ply, white_of};
+use super::points::read_cloud;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, rig};
-use splat4d::format::npy::Npy;
+use splat4d::Result;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
-use splat4d::{Error, Result};
 use std::path::Path;
 
 /// Upwards in the studio.
@@ -136,8 +135,8 @@ fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCl
     let plys: Vec<&str> =
         names.iter().map(String::as_str).filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
     match plys[..] {
-        [only] => read_ply(&root.join(only)).map(Some),
-        _ if names.iter().any(|n| n == ARCHIVE) => read_archive(&root.join(ARCHIVE)).map(Some),
+        [only] => read_cloud(&root.join(only)).map(Some),
+        _ if names.iter().any(|n| n == ARCHIVE) => read_cloud(&root.join(ARCHIVE)).map(Some),
         [] => Ok(None),
         _ => {
             warnings.push(format!(
@@ -151,23 +150,3 @@ fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCl
 
 /// Luiten's own cloud: `data` of shape `[N, 7]`: position, sRGB from 0 to 1, foreground.
 const ARCHIVE: &str = "init_pt_cld.npz";
-
-fn read_archive(path: &Path) -> Result<PointCloud> {
-    let bytes = json::read_bytes(path)?;
-    let array = Npy::read_member(&bytes, "data").map_err(|e| e.at(path.display()))?;
-    let columns = match array.shape[..] {
-        [_, columns] if columns >= 6 => columns,
-        _ => {
-            let what = format!("expected an array of shape [points, 7], found {:?}", array.shape);
-            return Err(Error::input(what).at(path.display()).remedy("Remove the file to start without it."));
-        }
-    };
-    let numbers = array.to_f64();
-    let rows = || numbers.chunks_exact(columns);
-    let white = white_of(rows().flat_map(|row| row[3..6].iter().map(|v| *v as f32)));
-    let mut cloud = PointCloud::default();
-    for row in rows() {
-        cloud.push([row[0], row[1], row[2]], [row[3], row[4], row[5]].map(|v| v as f32 / white), None);
-    }
-    Ok(cloud)
-}

@@ -3,17 +3,80 @@
 use super::json::read_bytes;
 use super::pose::FARTHEST;
 use rayon::prelude::*;
-use splat4d::Result;
+use splat4d::format::npy::Npy;
 use splat4d::format::ply;
+use splat4d::{Error, Result};
 use std::borrow::Cow;
 use std::path::Path;
 
 /// Colour of points that have none.
 const GREY: f32 = 0.5;
 
-/// Reads the points of a .ply file with their colours and, where it states them, their times.
-pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
-    cloud(&read_bytes(path)?).map_err(|e| e.at(path.display()))
+/// Arrays of an .npz archive that hold points: Luiten's own name first.
+const ARRAYS: [&str; 3] = ["data", "points", "xyz"];
+/// How point clouds begin that are not read, and what they are called.
+const UNREAD: [(&[u8], &str); 6] = [
+    (b"LASF", "a .las or .laz file"),
+    (b"# .PCD", "a .pcd file"),
+    (b"VERSION .", "a .pcd file"),
+    (b"ASTM-E57", "an .e57 file"),
+    (b"glTF", "a .glb file"),
+    (b"\x89HDF", "an HDF5 file"),
+];
+
+/// Reads the points of a .ply, .npy or .npz file, whatever its name, with their colours and, where a .ply states them, their times.
+pub(super) fn read_cloud(path: &Path) -> Result<PointCloud> {
+    let bytes = read_bytes(path)?;
+    let read = match &bytes[..] {
+        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Npy::read(&bytes).and_then(|array| of_array(&array)),
+        [b'P', b'K', 3 | 5, ..] => of_archive(&bytes),
+        _ if bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes).starts_with(b"ply")
+            || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) =>
+        {
+            cloud(&bytes)
+        }
+        _ => Err(unread(&bytes)),
+    };
+    read.map_err(|e| e.at(path.display()))
+}
+
+/// Why a file of points is not read.
+fn unread(bytes: &[u8]) -> Error {
+    let known = UNREAD.iter().find(|(start, _)| bytes.starts_with(start)).map(|(_, what)| *what);
+    let text = || std::str::from_utf8(&bytes[..bytes.len().min(1 << 10)]).is_ok();
+    let what = known.unwrap_or_else(|| if text() { "text" } else { "a file of another kind" });
+    Error::input(format!("expected points as .ply, .npy or .npz, found {what}")).remedy(
+        "Convert it to .ply with CloudCompare or MeshLab, or save an array of shape [points, 3], or [points, 6] with colours, with \
+         numpy.save",
+    )
+}
+
+/// The points of an archive of arrays.
+fn of_archive(bytes: &[u8]) -> Result<PointCloud> {
+    let mut read = ARRAYS.iter().map(|name| Npy::read_member(bytes, name));
+    // Of several errors the one that names the arrays of the archive and asks for `points`.
+    let found = read.find(Result::is_ok).unwrap_or_else(|| Npy::read_member(bytes, ARRAYS[1]));
+    of_array(&found?)
+}
+
+/// The points of an array with a row of 3 coordinates each, then perhaps 3 colours and other columns.
+fn of_array(array: &Npy) -> Result<PointCloud> {
+    let (columns, colored) = match array.shape[..] {
+        [_, 3] => (3, false),
+        [_, columns] if columns >= 6 => (columns, true),
+        _ => {
+            let what = format!("expected an array of shape [points, 3] or [points, 6], found {:?}", array.shape);
+            return Err(Error::input(what)
+                .remedy("Save positions, or positions and colours; or remove the file to start without it"));
+        }
+    };
+    let numbers = array.to_f64();
+    let rows = || numbers.chunks_exact(columns);
+    let colors = |row: &[f64]| if colored { [row[3], row[4], row[5]].map(|v| v as f32) } else { [GREY; 3] };
+    let white = white_of(rows().flat_map(colors));
+    let mut cloud = PointCloud::default();
+    rows().for_each(|row| cloud.push([row[0], row[1], row[2]], colors(row).map(|v| v / white), None));
+    Ok(cloud)
 }
 
 fn cloud(bytes: &[u8]) -> Result<PointCloud> {
@@ -29,8 +92,8 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
     Ok(cloud)
 }
 
-/// The number that represents full colour in colours of floating point: 1, or 255 where most are above 1.
-pub(super) fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
+/// The number that stands for full colour in colours of floating point: 1, or 255 where most are above 1.
+fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
     let (above, all) = colors.fold((0usize, 0usize), |(above, all), c| (above + usize::from(c > 1.0), all + 1));
     if 2 * above > all { 255.0 } else { 1.0 }
 }
@@ -228,6 +291,44 @@ mod tests {
         assert_eq!(super::cloud(&cloud.to_ply("comment made up")).unwrap(), cloud);
         let none = PointCloud::default();
         assert_eq!(super::cloud(&none.to_ply("comment made up")).unwrap(), none);
+    }
+
+    #[test]
+    fn arrays_are_read_by_their_content_and_other_clouds_are_named() {
+        let work = tempfile::tempdir().unwrap();
+        let read = |name: &str, bytes: &[u8]| {
+            let path = work.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            read_cloud(&path).map_err(|e| e.to_string())
+        };
+        let array = |shape: &[usize], data: &[f32]| {
+            let mut bytes = Vec::new();
+            splat4d::format::npy::write_f32(shape, data, &mut bytes).unwrap();
+            bytes
+        };
+        let positions = read("a.npy", &array(&[2, 3], &[1.0, -2.0, 3.0, 0.0, f32::NAN, 0.0])).unwrap();
+        assert_eq!(
+            (&positions.points[..], positions.colors[0], positions.left_out),
+            (&[[1.0, -2.0, 3.0]][..], [GREY; 3], 1)
+        );
+        for row in [[1.0, -2.0, 3.0, 51.0, 255.0, 102.0], [1.0, -2.0, 3.0, 0.2, 1.0, 0.4]] {
+            // The name does not decide.
+            let colored = read("a.ply", &array(&[1, 6], &row)).unwrap();
+            assert_eq!((colored.points[0], colored.colors[0]), ([1.0, -2.0, 3.0], [0.2, 1.0, 0.4]));
+        }
+        let text = read("a.npy", &array(&[4], &[0.0; 4])).unwrap_err();
+        assert!(text.contains("[points, 3] or [points, 6], found [4]"), "{text}");
+        for (bytes, what) in [
+            (&b"LASF\x01"[..], "a .las or .laz file"),
+            (b"# .PCD v0.7\n", "a .pcd file"),
+            (b"1.0 2.0 3.0\n", "text"),
+            (&[0xff, 0xfe, 0, 1], "another kind"),
+        ] {
+            let text = read("a.xyz", bytes).unwrap_err();
+            assert!(text.contains(what) && text.contains("numpy.save") && text.contains("a.xyz"), "{text}");
+        }
+        assert!(read("a.npz", b"PK\x05\x06").is_err());
+        assert!(read("a.ply", b"").unwrap_err().contains("PLY"));
     }
 
     #[test]

@@ -19,9 +19,28 @@ const OUTPUT_CAMERAS: &str = "cameras.json";
 const OUTPUT_SETTINGS: &str = "cfg_args";
 const CHECKPOINTS: &str = "nerfstudio_models";
 const SCENE_ENDINGS: &[&str] = &["ply", "spz", "splat", "splatv", "sog", "ksplat", "glb", "s4d", "pt", "ckpt"];
-/// Bytes of a JSON file in which its keys are searched for.
+/// Projects and poses of other programs that are not read: endings, what they are, and what to do.
+const PROJECTS: [(&str, &str, &str); 6] = [
+    ("psx", "a project of Metashape", METASHAPE),
+    ("psz", "a project of Metashape", METASHAPE),
+    ("rcproj", "a project of RealityCapture", REALITYSCAN),
+    ("rsproj", "a project of RealityScan", REALITYSCAN),
+    ("nvm", "a reconstruction of VisualSFM", AS_COLMAP),
+    ("p4d", "a project of Pix4D", AS_COLMAP),
+];
+const METASHAPE: &str = "export its cameras next to the photos (File, Export, Export Cameras, Agisoft XML)";
+const REALITYSCAN: &str =
+    "export the registration next to the images as \"Internal/External camera parameters\" (.csv)";
+const AS_COLMAP: &str = "export the cameras as COLMAP";
+/// Files and folders of captures of Nerfies.
+const NERFIES: [&str; 4] = ["dataset.json", "metadata.json", "camera", "rgb"];
+/// Numbers next to the name of an image in a line that describes its camera, at least.
+const POSE_NUMBERS: usize = 6;
+/// Bytes of a text in which keys are searched for.
 const HEAD: u64 = 1 << 16;
-/// Folders that are searched for a capture.
+/// First lines of a table that are examined.
+const HEADER_LINES: usize = 5;
+/// Folders that are looked into for a capture.
 const MOST_FOLDERS: usize = 100;
 
 /// Remedy for a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds nothing
@@ -40,6 +59,16 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     }
     if let Some(name) = names.iter().find(|n| ends(Path::new(n), ARCHIVE_ENDINGS)) {
         return Some(format!("{name} is an archive: unpack it, and give the folder that it makes."));
+    }
+    if names.iter().any(|n| n == NERFIES[0]) && NERFIES[1..].iter().any(|n| root.join(n).is_dir()) {
+        let missing: Vec<&str> = NERFIES.into_iter().filter(|n| !root.join(n).exists()).collect();
+        return Some(format!(
+            "It looks like a capture of Nerfies, HyperNeRF or DyCheck, but has no {}: copy it too.",
+            missing.join(", ")
+        ));
+    }
+    if let Some(advice) = foreign_poses(root, &names) {
+        return Some(advice);
     }
     if let Some(advice) = scenes(root, &names) {
         return Some(advice);
@@ -70,7 +99,45 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     images.then(|| format!("It holds images, but no camera poses: {reconstruct}."))
 }
 
-/// Remedy for scenes given as captures: outputs of trainings and files of Gaussians. `None`: there are none.
+/// What to do with poses and projects of other programs. `None`: there are none.
+fn foreign_poses(root: &Path, names: &[String]) -> Option<String> {
+    for (ending, what, remedy) in PROJECTS {
+        if let Some(name) = names.iter().find(|n| ends(Path::new(n), &[ending])) {
+            return Some(format!("{name} is {what}: {remedy}."));
+        }
+    }
+    let blocks = |n: &&String| ends(Path::new(n), &["xml"]) && head(&root.join(n)).contains("<BlocksExchange");
+    if let Some(name) = names.iter().find(blocks) {
+        return Some(format!("{name} has poses as BlocksExchange, which is not read: {AS_COLMAP}."));
+    }
+    // COLMAP's own table is part of a model.
+    let is_other = |n: &&String| !n.eq_ignore_ascii_case("images.txt");
+    let is_table = |n: &&String| ends(Path::new(n), &["csv", "txt"]) && is_table(&head(&root.join(n)));
+    let table = names.iter().filter(is_other).find(is_table)?;
+    Some(format!(
+        "{table} is a table of images with numbers, without names of columns that are known: begin it with name, x, y, alt, heading, \
+         pitch, roll, f, px, py (docs/layouts.md), or export the cameras as COLMAP."
+    ))
+}
+
+/// The beginning of a file as text; empty where it cannot be read.
+fn head(path: &Path) -> String {
+    let mut head = Vec::new();
+    let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD).read_to_end(&mut head).is_ok());
+    if read { String::from_utf8_lossy(&head).into_owned() } else { String::new() }
+}
+
+/// Whether one of the first lines of a text names an image and many numbers.
+fn is_table(text: &str) -> bool {
+    let of_pose = |line: &str| {
+        let cells: Vec<&str> = line.split([',', ';', '\t', ' ']).map(|c| c.trim_matches('"')).collect();
+        cells.iter().any(|c| rig::is_image(c))
+            && cells.iter().filter(|c| c.parse::<f64>().is_ok()).count() >= POSE_NUMBERS
+    };
+    text.lines().take(HEADER_LINES).any(of_pose)
+}
+
+/// What to do with scenes that are no captures: outputs of trainings and files of Gaussians. `None`: there are none.
 fn scenes(root: &Path, names: &[String]) -> Option<String> {
     let checkpoints = root.join(CHECKPOINTS);
     let newest = rig::file_names(&checkpoints).into_iter().rfind(|n| ends(Path::new(n), &["ckpt"]));
@@ -114,12 +181,7 @@ fn above(root: &Path) -> Option<PathBuf> {
 
 /// Whether a JSON file, whatever its name, lists frames with matrices as a transforms file does.
 pub(super) fn is_transforms(path: &Path) -> bool {
-    if !ends(path, &["json"]) || !path.is_file() {
-        return false;
-    }
-    let mut head = Vec::new();
-    let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD).read_to_end(&mut head).is_ok());
-    read && String::from_utf8_lossy(&head).contains("\"transform_matrix\"")
+    ends(path, &["json"]) && path.is_file() && head(path).contains("\"transform_matrix\"")
 }
 
 /// The first video in a folder, or in the usual one below it.

@@ -12,7 +12,7 @@ use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
-use super::points::read_ply;
+use super::points::read_cloud;
 use super::sequence::{self, FrameOrder};
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Sequence, Split, colmap, picture};
@@ -196,7 +196,7 @@ impl Document {
         if let Some(name) = top.opt("ply_file_path")? {
             let path = lookup.file(name.text()?)?;
             if path.is_file() {
-                let cloud = read_ply(&path)?;
+                let cloud = read_cloud(&path)?;
                 points = Some((path, cloud));
             } else {
                 warning = Some(format!("The initial points that ply_file_path names are missing: {}.", path.display()));

@@ -20,7 +20,7 @@ use splat4d::math::se3::{norm, sub};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, HeadKeys, LIFE, LifeKind, Params, SH};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Points to start from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -96,8 +96,8 @@ impl Seeds {
 settings! {
     /// Initial Gaussians.
     pub struct InitSettings {
-        /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
-        /// file.
+        /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a file
+        /// of points (.ply, .npy, .npz).
         source: Source = Source::Auto;
         /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000
         /// Gaussians. If a capture has fewer points, more are placed between them along surfaces; hulls of masks and of
@@ -134,11 +134,13 @@ pub enum Source {
     Hull,
     /// At random in the cameras' common volume.
     Random,
-    /// The points of a .ply file.
+    /// The points of a .ply, .npy or .npz file.
     File(PathBuf),
 }
 
 impl Source {
+    /// Endings of files of points.
+    const ENDINGS: [&'static str; 3] = ["ply", "npy", "npz"];
     const WORDS: [(&'static str, Self); 5] = [
         ("auto", Self::Auto),
         ("points", Self::Points),
@@ -159,13 +161,13 @@ impl Value for Source {
 
     fn from_toml(value: &toml::Value) -> std::result::Result<Self, String> {
         let word = value.as_str().unwrap_or_default();
-        if word.ends_with(".ply") {
+        if Path::new(word).extension().is_some_and(|e| Self::ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v))) {
             return Ok(Self::File(word.into()));
         }
         let known = Self::WORDS.into_iter().find(|(name, _)| *name == word);
-        known
-            .map(|(_, source)| source)
-            .ok_or_else(|| among(value, &[&Self::WORDS.map(|(word, _)| word)[..], &["a .ply file"]].concat()))
+        known.map(|(_, source)| source).ok_or_else(|| {
+            among(value, &[&Self::WORDS.map(|(word, _)| word)[..], &["a .ply, .npy or .npz file"]].concat())
+        })
     }
 }
 

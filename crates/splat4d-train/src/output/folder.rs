@@ -3,7 +3,7 @@
 use super::cannot_write;
 use super::list::{self, List};
 use super::owner::{Owner, in_use};
-use super::place::{Input, check_apart};
+use super::place::{Input, check_inputs, check_no_capture};
 use super::temporary::is_temporary;
 use super::{STATE, legacy, write_atomically};
 use crate::path_text::in_command;
@@ -87,11 +87,12 @@ enum Plan {
 impl OutputFolder {
     /// Takes a folder for a command, and makes it where it is not there.
     ///
-    /// Errors: it equals, contains or is inside what is read; another process has it; its content would mix with the
-    /// output and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be
-    /// written. Nothing is changed then.
+    /// Errors: it equals, contains or is inside what is read or any capture; another process has it; it holds what would mix with the output
+    /// and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be written. Nothing
+    /// is changed then.
     pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, FolderContent)> {
-        check_apart(path, request.inputs)?;
+        check_inputs(path, request.inputs)?;
+        check_no_capture(path, request.inputs)?;
         if path.exists() && !path.is_dir() {
             return Err(Error::input("is a file").at(path.display()).remedy("Give the name of a folder."));
         }

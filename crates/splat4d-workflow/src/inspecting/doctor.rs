@@ -30,5 +30,5 @@ pub(super) fn of(capture: &Capture, folder: &Path, console: &dyn Listener) -> Re
     let mut json = serde_json::to_value(&report).expect("a report is plain data");
     json["type"] = json!("doctor");
     json["page"] = json!(html.to_string_lossy());
-    Ok(Inspection { json, text, troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false })
 }

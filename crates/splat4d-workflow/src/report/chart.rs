@@ -4,11 +4,11 @@
 use std::fmt::Write;
 
 const WIDTH: f64 = 520.0;
-const HEIGHT: f64 = 240.0;
+const HEIGHT: f64 = 246.0;
 const LEFT: f64 = 52.0;
 const RIGHT: f64 = 14.0;
 const TOP: f64 = 12.0;
-const BOTTOM: f64 = 34.0;
+const BOTTOM: f64 = 40.0;
 /// Points a curve is reduced to (means of equal runs): more cannot be seen at this width.
 const MAX_POINTS: usize = 260;
 /// Points that get a tooltip.

@@ -26,7 +26,7 @@ pub fn page(entries: &[Entry]) -> String {
 }
 
 fn table(out: &mut String, entries: &[Entry]) {
-    let ((head, rows), best) = (comparing::table(entries), comparing::best(entries));
+    let ((head, rows), best) = (comparing::table_to_read(entries), comparing::best(entries));
     out.push_str("<h2>Held-out views</h2>\n<table><tr>");
     head.iter().for_each(|h| _ = write!(out, "<th{}>{}</th>", alignment(h), escape(&titled(h))));
     out.push_str("</tr>\n");

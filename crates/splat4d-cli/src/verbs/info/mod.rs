@@ -70,7 +70,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for trouble in &found.troubles {
         found.text += &format!("! {}\n", in_line(trouble));
     }
-    let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
+    let verdict = match (healthy, found.poses_unchecked) {
+        (false, _) => "does not look healthy, see above",
+        (true, true) => "looks healthy, but whether its poses are right was not checked, see above",
+        (true, false) => "looks healthy",
+    };
     console.report(&format!("{}{verdict}", found.text), healthy);
     args.verdict(healthy)
 }

@@ -3,7 +3,7 @@
 
 use super::super::account::Severity;
 use super::super::account::{Account, Aspect};
-use super::super::points::read_ply;
+use super::super::points::read_cloud;
 use super::super::{PointCloud, rig};
 use super::Shot;
 use splat4d::Result;
@@ -59,5 +59,5 @@ pub(super) fn rename(root: &Path, shots: &mut Vec<Shot>, account: &mut Account) 
 /// The layout's own cloud.
 pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
     let path = root.join(POINTS);
-    path.is_file().then(|| read_ply(&path)).transpose()
+    path.is_file().then(|| read_cloud(&path)).transpose()
 }

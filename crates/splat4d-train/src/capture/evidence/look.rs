@@ -92,25 +92,45 @@ pub(super) fn describe_each(images: &mut [&mut SmallImage], detail: Detail) {
     });
 }
 
-/// Means of boxes of one channel (or of alpha) of an image.
-fn reduced(raster: &Raster, channel: usize, k: usize) -> Vec<f32> {
-    let (sums, most) = match &raster.samples {
-        Samples::Eight(samples) => (box_sums(samples, raster, channel, k), 255.0),
-        Samples::Sixteen(samples) => (box_sums(samples, raster, channel, k), 65535.0),
-    };
-    let full = most * (k * k) as f64;
-    sums.into_iter().map(|sum| (sum as f64 / full) as f32).collect()
+/// Means of boxes of all channels of an image, channel by channel.
+fn reduced(raster: &Raster, k: usize) -> Vec<Vec<f32>> {
+    match &raster.samples {
+        Samples::Eight(samples) => means(samples, raster, k, 255.0),
+        Samples::Sixteen(samples) => means(samples, raster, k, 65535.0),
+    }
 }
 
-/// Box sums in integers, because they dominate the time for a large image.
-fn box_sums<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, channel: usize, k: usize) -> Vec<u64> {
-    let (width, height) = (raster.width / k, raster.height / k);
-    let mut out = vec![0u64; width * height];
+fn means<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, k: usize, most: f64) -> Vec<Vec<f32>> {
+    let (width, height, full) = (raster.width / k, raster.height / k, most * (k * k) as f64);
+    let size = [raster.width, width, height];
+    match raster.channels {
+        1 => planes(&box_sums::<T, 1>(samples, size, k), full),
+        2 => planes(&box_sums::<T, 2>(samples, size, k), full),
+        3 => planes(&box_sums::<T, 3>(samples, size, k), full),
+        _ => planes(&box_sums::<T, 4>(samples, size, k), full),
+    }
+}
+
+fn planes<const C: usize>(sums: &[[u64; C]], full: f64) -> Vec<Vec<f32>> {
+    (0..C).map(|c| sums.iter().map(|sum| (sum[c] as f64 / full) as f32).collect()).collect()
+}
+
+/// Sums of boxes of an image of `C` channels: whole numbers in one pass, as most of the time of looking at a large image would go
+/// here. `size`: width of the image, width and height of the result.
+fn box_sums<T: Copy + Into<u64>, const C: usize>(
+    samples: &[T],
+    [across, width, height]: [usize; 3],
+    k: usize,
+) -> Vec<[u64; C]> {
+    let mut out = vec![[0u64; C]; width * height];
     for y in 0..height * k {
-        let start = y * raster.width * raster.channels + channel;
-        let mut row = samples[start..].iter().step_by(raster.channels).copied();
-        for sum in &mut out[y / k * width..][..width] {
-            *sum += row.by_ref().take(k).map(Into::into).sum::<u64>();
+        let row = &samples[y * across * C..][..width * k * C];
+        for (sum, part) in out[y / k * width..][..width].iter_mut().zip(row.chunks_exact(k * C)) {
+            for pixel in part.chunks_exact(C) {
+                for c in 0..C {
+                    sum[c] += pixel[c].into();
+                }
+            }
         }
     }
     out
@@ -138,11 +158,12 @@ impl SmallImage {
         if width == 0 || height == 0 {
             return None;
         }
-        let alpha = raster.alpha().map(|a| reduced(&raster, a, factor));
+        let mut small = reduced(&raster, factor);
+        let alpha = raster.alpha().map(|a| small.swap_remove(a));
         let mut color = Planes::new(3, height, width);
         let under = background.unwrap_or([1.0; 3]);
         for c in 0..3 {
-            let plane = reduced(&raster, if raster.channels < 3 { 0 } else { c }, factor);
+            let plane = &small[if raster.channels < 3 { 0 } else { c }];
             let out = &mut color.data[c * width * height..(c + 1) * width * height];
             for (p, v) in out.iter_mut().enumerate() {
                 let a = alpha.as_ref().map_or(1.0, |a| a[p]);

@@ -10,6 +10,7 @@ mod look;
 mod motion;
 mod outliers;
 mod pairs;
+mod parts;
 mod points;
 mod silhouettes;
 #[cfg(test)]
@@ -24,10 +25,13 @@ pub use motion::Agreement;
 use splat4d::math::Se3;
 use std::collections::BTreeSet;
 
-/// Images that are examined, at most; and at least, where they are large.
+/// Images that are examined first: at least, where they are large, and at most.
 const CHECKED: [usize; 2] = [4, 10];
-/// Pixels that are decoded, at most: a second of one core.
-const PIXELS: usize = 40_000_000;
+/// The same at most of captures of which parts are examined too.
+const CHECKED_BEFORE_PARTS: usize = 6;
+/// Pixels that are decoded first, at most, unless the least images have more: a third of a second of one core. Their features
+/// take longer.
+const PIXELS: usize = 25_000_000;
 /// Mean part of images that their masks show, from which these hide nothing: less than half a level of 8 bits.
 const HIDES_NOTHING: f64 = 0.999;
 /// Part of a moving camera's frames between two that are examined: neighbours overlap, and are apart.
@@ -57,16 +61,27 @@ pub struct PoseCheck {
 impl Capture {
     /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
     pub fn check_poses(&self) -> PoseCheck {
-        let mut images = look::take(self, &self.looked_at(), look::COARSE);
+        let order = outliers::places(self);
+        let mut images = look::take(self, &self.looked_at(order.len()), look::COARSE);
         let mut matches = None;
-        let mut check = self.judge(&mut images, &mut matches);
+        let mut check = self.judge(&points::frames(self), &mut images, &mut matches);
+        if check.finding.aspect == Some(Aspect::NotChecked)
+            && let Some(matches) = &matches
+        {
+            let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
+            check.finding = pairs::contradiction(matches, &images, &poses).unwrap_or(check.finding);
+        }
         if !check.misread {
             let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
             check.more.extend(focal::check(self, matches.as_deref(), &images, &poses));
             check.more.extend(check_masks(&images, &poses));
             check.more.extend(copies::check(self));
+            if order.len() > outliers::ALL && check.finding.severity == Severity::Note {
+                let seen: Vec<usize> = images.iter().map(|l| l.frame).collect();
+                check.more.extend(parts::check(self, &order, &seen));
+            }
             let pixels: usize = images.iter().map(|l| l.camera.width * l.camera.height).sum();
-            check.more.extend(outliers::check(self, images, PIXELS.saturating_sub(pixels)));
+            check.more.extend(outliers::check(self, &order, images, PIXELS.saturating_sub(pixels)));
         }
         check
     }
@@ -113,8 +128,9 @@ impl Capture {
         findings
     }
 
-    /// The verdict by these images; features are found and matched if points do not suffice.
-    fn judge(&self, images: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
+    /// The verdict by these images, and by the points that the frames `spread` see; features are found and matched if points do not
+    /// say enough.
+    fn judge(&self, spread: &[usize], images: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
         let mut conventions = vec![Poses::STATED];
         conventions.extend(self.convention.others());
         let posed = |f: &Frame, p: Poses| match p {
@@ -125,12 +141,11 @@ impl Capture {
             frames.iter().map(|&i| posed(&self.frames[i], p)).collect()
         };
         let mut measures = vec![Measure::default(); conventions.len()];
-        let spread = points::frames(self);
         let seen: Vec<usize> = images.iter().map(|l| l.frame).collect();
         let poses: Vec<Option<Vec<Se3>>> = conventions.iter().map(|&p| all(&seen, p)).collect();
         for ((m, &p), poses) in measures.iter_mut().zip(&conventions).zip(&poses) {
-            let (Some(spread_poses), Some(poses)) = (all(&spread, p), poses) else { continue };
-            m.points = points::measure(self, (&spread, &spread_poses), (images, poses));
+            let (Some(spread_poses), Some(poses)) = (all(spread, p), poses) else { continue };
+            m.points = points::measure(self, (spread, &spread_poses), (images, poses));
             m.foreground = silhouettes::measure(images, poses);
         }
         // Points whose colours agree suffice.
@@ -144,10 +159,12 @@ impl Capture {
         self.conclude(&conventions, &measures)
     }
 
-    /// The frames that are examined: cameras of one time in their order, or frames of a moving camera in a row.
-    fn looked_at(&self) -> Vec<usize> {
+    /// The frames that are examined first, of a capture of so many places: cameras of one time in their order, or frames of a moving
+    /// camera in a row.
+    fn looked_at(&self, places: usize) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
-        let most = (PIXELS / pixels).clamp(CHECKED[0], CHECKED[1]);
+        let most = if places > outliers::ALL { CHECKED_BEFORE_PARTS } else { CHECKED[1] };
+        let most = (PIXELS / pixels).clamp(CHECKED[0], most);
         let mut counts = std::collections::BTreeMap::<usize, Vec<usize>>::new();
         for &i in &self.train {
             counts.entry(self.frames[i].index).or_default().push(i);

@@ -14,9 +14,9 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Captures of at most this many places are compared image by image; of larger ones the conspicuous poses.
-const ALL: usize = 24;
-/// Conspicuous poses that are examined at most, and share of all positions: more are a property of the capture.
+/// Captures of at most so many places are compared image by image; of larger ones the conspicuous poses.
+pub(super) const ALL: usize = 24;
+/// Conspicuous poses that are looked into at most, and of all places: where more are so, it is how the capture is.
 const SUSPECTS: usize = 4;
 const FEW: f64 = 0.2;
 /// Images before and after that an image is compared with: in most captures they overlap.
@@ -61,12 +61,11 @@ impl Sign {
     }
 }
 
-/// Searches for single wrong poses; `images` are images that were already read.
-pub(super) fn check(capture: &Capture, images: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
-    let order = places(capture);
-    let signs = signs(capture, &order);
+/// Looks for single wrong poses among the places `order`; `images` are images that are read already.
+pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
+    let signs = signs(capture, order);
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
-    let (chosen, compared) = chosen(&order, &signs, (pixels / size).max(2 * BESIDE + 1));
+    let (chosen, compared) = chosen(order, &signs, (pixels / size).max(2 * BESIDE + 1));
     let frames: Vec<usize> = chosen.iter().map(|&k| order[k]).collect();
     let mut images: Vec<SmallImage> = images.into_iter().filter(|l| frames.contains(&l.frame)).collect();
     let missing: Vec<usize> = frames.iter().copied().filter(|f| images.iter().all(|l| l.frame != *f)).collect();
@@ -74,7 +73,7 @@ pub(super) fn check(capture: &Capture, images: Vec<SmallImage>, pixels: usize) -
     images.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
     let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
     let gain = |l: &SmallImage| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
-    let strange = strange(capture, &order, &images, &gain);
+    let strange = strange(capture, order, &images, &gain);
     let vouched = |l: &SmallImage| gain(l).is_some_and(|gain| gain >= VOUCHED);
     let place = |l: &SmallImage| order.iter().position(|f| *f == l.frame).unwrap_or(0);
     let doubtful: Vec<usize> = images.par_iter().filter(|l| !vouched(l)).map(place).collect();
@@ -258,9 +257,9 @@ fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Opt
     Some(Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy })
 }
 
-/// One frame of every position that has a pose of its own: of a fixed camera the one that is nearest to the time of
-/// which most is seen, of moving ones all for training; ordered as they were taken.
-fn places(capture: &Capture) -> Vec<usize> {
+/// One frame of every place that has a pose of its own: of a fixed camera the one that is nearest to the time of which most is
+/// seen, of moving ones all for training; ordered as they were taken.
+pub(super) fn places(capture: &Capture) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     capture.train.iter().for_each(|&i| *counts.entry(capture.frames[i].index).or_default() += 1);
     let fullest = counts.into_iter().rev().max_by_key(|(_, n)| *n).map_or(0, |(index, _)| index);

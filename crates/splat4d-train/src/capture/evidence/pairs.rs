@@ -1,10 +1,14 @@
 //! Features that two images share, and whether poses put them on each other's epipolar lines, in front of both cameras.
 
+use super::super::Aspect;
+use super::super::account::Severity;
 use super::super::pose::same_pose;
+use super::super::preflight::Finding;
 use super::look::{Mark, SmallImage};
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::math::se3::{cross, dot, mat_vec, norm, normalize, sub, transpose};
+use std::collections::BTreeMap;
 
 /// The second best match is this many times farther away (Lowe 2004).
 const RATIO: f64 = 0.8;
@@ -21,10 +25,16 @@ const ONE_PLACE: f64 = 1e-6;
 const MORE: (usize, usize) = (20, 4);
 /// Of its matches, how many the poses as read fit at most where another convention is right.
 const RIVAL: f64 = 0.8;
+/// Matches of two images that show one place, and pairs of such images from which matches contradict poses if at most this share
+/// fits: what fits by chance is near its lines.
+const OVERLAP: usize = 20;
+const OVERLAPPING: usize = 2;
+const WRONG: f64 = 0.15;
 /// Share of the matches that a right convention fits at least: many are chance.
 const FITTING: f64 = 0.2;
 
-/// A match of features of these two images: their rays.
+/// Two features that look alike, of these images: their rays.
+#[derive(Clone, Copy)]
 pub(super) struct Match {
     images: [usize; 2],
     rays: [[f64; 2]; 2],
@@ -137,7 +147,27 @@ pub(super) fn fitting(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -
     matches.iter().filter(|m| fits(m, images, poses, least)).count()
 }
 
-/// Baselines from which cameras are in two places.
+/// A warning where some pairs of images match well, and these matches do not fit the poses.
+pub(super) fn contradiction(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
+    let mut of_pairs: BTreeMap<[usize; 2], Vec<Match>> = BTreeMap::new();
+    matches.iter().for_each(|m| of_pairs.entry(m.images).or_default().push(*m));
+    of_pairs.retain(|_, of_pair| of_pair.len() >= OVERLAP);
+    let shared: Vec<Match> = of_pairs.values().flatten().copied().collect();
+    let (all, fitting) = (shared.len(), fitting(&shared, images, poses));
+    (of_pairs.len() >= OVERLAPPING && fitting as f64 <= WRONG * all as f64).then(|| Finding {
+        severity: Severity::Warning,
+        aspect: Some(Aspect::Assumed),
+        what: format!(
+            "Poses and images do not fit: {fitting} of {all} matches between images that show one place fit the poses, and no other \
+             convention fits clearly better."
+        ),
+        remedy: "Check that images match their names, and how poses are written: the order of quaternions, the axes, one world for \
+                 all."
+            .into(),
+    })
+}
+
+/// Baselines from which cameras stand in two places.
 fn least(centers: &[[f64; 3]]) -> f64 {
     let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
     ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))

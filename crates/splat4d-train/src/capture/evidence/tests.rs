@@ -68,17 +68,17 @@ fn shown(i: usize, x: u32, y: u32) -> Option<([f64; 3], bool)> {
 /// Photos of the scene, with initial points or without: rendered once.
 fn photos(points: bool) -> Capture {
     static MADE: OnceLock<(Sample, Capture)> = OnceLock::new();
-    let (_, made) = MADE.get_or_init(|| capture(true, false));
+    let (_, made) = MADE.get_or_init(|| capture(true, false, CAMERAS));
     Capture { points: made.points.clone().filter(|_| points), ..made.clone() }
 }
 
 /// Photos of the scene in a transforms.json; `cut`: the ball alone, with alpha.
-fn capture(points: bool, cut: bool) -> (Sample, Capture) {
+fn capture(points: bool, cut: bool, cameras: usize) -> (Sample, Capture) {
     let sample = Sample::new(&["transforms.json"]);
     let mut frames = Vec::new();
     let mut ply = String::new();
     let mut count = 0;
-    for i in 0..CAMERAS {
+    for i in 0..cameras {
         let byte = |v: f32| (v * 255.0).round() as u8;
         let color = |x: u32, y: u32| shown(i, x, y).map_or([90, 120, 200], |(p, _)| texture(p).map(byte));
         let name = format!("images/cam{i:02}.png");
@@ -115,7 +115,7 @@ fn capture(points: bool, cut: bool) -> (Sample, Capture) {
     }
     sample.write("transforms.json", top.to_string().as_bytes());
     let capture = Capture::open(sample.root(), &CaptureOptions::default()).unwrap();
-    assert_eq!((capture.kind, capture.frames.len()), (CaptureKind::Nerfstudio, CAMERAS));
+    assert_eq!((capture.kind, capture.frames.len()), (CaptureKind::Nerfstudio, cameras));
     (sample, capture)
 }
 
@@ -140,13 +140,18 @@ fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
     out
 }
 
+/// The verdict by these images and all points.
+fn judged(capture: &Capture, images: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
+    capture.judge(&points::frames(capture), images, matches)
+}
+
 /// Conventions that are named right, of how many, and how many are named that are right.
 fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
-    let mut images = look::take(capture, &capture.looked_at(), look::COARSE);
+    let mut images = look::take(capture, &capture.looked_at(CAMERAS), look::COARSE);
     let mut matches = None;
     let (mut right, mut all) = (0, 0);
     for &stated in conventions {
-        let good = misread(capture, stated, Poses::STATED).judge(&mut images, &mut matches);
+        let good = judged(&misread(capture, stated, Poses::STATED), &mut images, &mut matches);
         assert_eq!(good.written_as, None, "{stated:?}: {}", good.finding.what);
         assert_eq!(good.finding.severity, Severity::Note);
         assert!(good.finding.what.contains("agree"), "{}", good.finding.what);
@@ -158,7 +163,7 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
                 continue;
             }
             all += 1;
-            let verdict = wrong.judge(&mut images, &mut matches);
+            let verdict = judged(&wrong, &mut images, &mut matches);
             let Some(found) = verdict.written_as else {
                 eprintln!("{stated:?} {poses}: {}", verdict.finding.what);
                 continue;
@@ -240,14 +245,14 @@ fn conventions_are_named_by_features() {
 
 #[test]
 fn conventions_are_named_by_foregrounds() {
-    let (_sample, mut capture) = capture(false, true);
+    let (_sample, mut capture) = capture(false, true, CAMERAS);
     // What is seen of the ball alone by cameras far apart has no features in common.
     capture.train.retain(|i| i % 2 == 1);
-    let mut images = look::take(&capture, &capture.looked_at(), look::COARSE);
+    let mut images = look::take(&capture, &capture.looked_at(CAMERAS), look::COARSE);
     let flipped: Poses = "opencv".parse().unwrap();
     let wrong = misread(&capture, Convention::NERF, flipped);
-    assert_eq!(wrong.judge(&mut images, &mut Some(Vec::new())).written_as, Some(flipped));
-    let right = misread(&capture, Convention::NERF, Poses::STATED).judge(&mut images, &mut Some(Vec::new()));
+    assert_eq!(judged(&wrong, &mut images, &mut Some(Vec::new())).written_as, Some(flipped));
+    let right = judged(&misread(&capture, Convention::NERF, Poses::STATED), &mut images, &mut Some(Vec::new()));
     assert!(right.written_as.is_none() && right.finding.what.contains("foregrounds"), "{}", right.finding.what);
 }
 
@@ -391,6 +396,52 @@ fn an_identity_pose_that_cannot_be_compared_is_not_checked() {
     assert!(check.more.iter().any(said), "{check:?}");
 }
 
+/// Poses that no convention explains, of images that match well.
+#[test]
+fn poses_that_matches_contradict_are_named() {
+    let mut capture = photos(false);
+    let spin = |k: usize| {
+        Se3::look_at([0.0; 3], [(5 * k) as f64, (k * k % 7) as f64 - 3.0, 1.0 + (k % 3) as f64], [0.0, 0.0, 1.0])
+    };
+    for (k, frame) in capture.frames.iter_mut().enumerate() {
+        frame.source.cam_from_world = spin(k).after(&frame.source.cam_from_world);
+    }
+    let check = capture.check_poses();
+    assert_eq!((check.written_as, check.finding.severity), (None, Severity::Warning), "{}", check.finding.what);
+    assert!(check.finding.what.contains("Poses and images do not fit"), "{}", check.finding.what);
+}
+
+/// A capture of which the first images are right and the others are not.
+#[test]
+fn a_part_that_does_not_fit_is_named() {
+    const COUNT: usize = 28;
+    let (_sample, made) = capture(true, false, COUNT);
+    let name = |i: usize| made.frames[i].image.display().to_string();
+    for points in [true, false] {
+        let right = Capture { points: made.points.clone().filter(|_| points), ..made.clone() };
+        assert_eq!(warned(&right), [""; 0], "points: {points}");
+        let mut flipped = right.clone();
+        let poses: Poses = "opencv".parse().unwrap();
+        for i in COUNT / 2..COUNT {
+            flipped.frames[i].source.cam_from_world = Convention::NERF.misread(&pose(i), poses);
+        }
+        let found = warned(&flipped);
+        let said = |w: &String| {
+            w.contains("another convention") && w.contains("a part of the images") && w.contains(&name(27))
+        };
+        assert!(found.iter().any(said), "points: {points}: {found:?}");
+        let mut lenses = right.clone();
+        for frame in &mut lenses.frames[COUNT / 2..] {
+            frame.source.intrinsics.fx *= 1.8;
+            frame.source.intrinsics.fy *= 1.8;
+        }
+        let found = warned(&lenses);
+        let said =
+            |w: &String| w.contains("Focal lengths are probably wrong") && w.contains("14 images with another lens");
+        assert!(!points || found.iter().any(said), "{found:?}");
+    }
+}
+
 #[test]
 fn focal_lengths_are_named_by_points_and_by_matches() {
     let focal = |factor: f64, points: bool| {
@@ -512,6 +563,6 @@ fn images_of_fixed_cameras_are_checked_once() {
     let frame = |(t, c): (usize, usize)| Frame { index: t, ..capture.frames[c].clone() };
     capture.frames = (0..4).flat_map(|t| (0..3).map(move |c| (t, c))).map(frame).collect();
     capture.train = (0..capture.frames.len()).collect();
-    let cameras: Vec<usize> = capture.looked_at().iter().map(|&i| capture.frames[i].camera).collect();
+    let cameras: Vec<usize> = capture.looked_at(3).iter().map(|&i| capture.frames[i].camera).collect();
     assert_eq!(cameras, [0, 1, 2]);
 }

@@ -69,14 +69,59 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCaptu
     take(root, shots, said, options)
 }
 
-fn shots(document: &Document<'_>, images: &Images, warnings: &mut Vec<String>) -> Result<Vec<Shot>> {
+/// The cameras of a chunk. Keyframes of animations are cameras too, without a sensor.
+fn cameras<'a, 'i>(chunk: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
+    chunk.descendants().filter(|n| n.has_tag_name("camera") && n.attribute("sensor_id").is_some())
+}
+
+fn is_enabled(camera: &Node<'_, '_>) -> bool {
+    camera.attribute("enabled").is_none_or(|v| v != "0" && v != "false")
+}
+
+fn pose_of<'a, 'i>(camera: Node<'a, 'i>) -> Option<Node<'a, 'i>> {
+    elements(camera, "transform").next()
+}
+
+/// How many cameras of a chunk can be read.
+fn readable(chunk: Node<'_, '_>) -> usize {
+    cameras(chunk).filter(|c| is_enabled(c) && pose_of(*c).is_some()).count()
+}
+
+/// The chunk with the most cameras that can be read, the first of equals. Errors: none has any.
+fn chunk<'a, 'i>(document: &'a Document<'i>, warnings: &mut Vec<String>) -> Result<Node<'a, 'i>> {
     let chunks: Vec<Node<'_, '_>> = elements(document.root_element(), "chunk").collect();
-    let Some(&chunk) = chunks.first() else {
+    let Some(&chunk) = chunks.iter().rev().max_by_key(|c| readable(**c)) else {
         return Err(Error::input("it has no chunk").remedy("Export the cameras as Agisoft XML."));
     };
-    if chunks.len() > 1 {
-        warnings.push(format!("The file has {} chunks; the first one is read.", chunks.len()));
+    if readable(chunk) == 0 {
+        let all: Vec<Node<'_, '_>> = chunks.iter().flat_map(|c| cameras(*c)).collect();
+        let enabled = all.iter().filter(|c| is_enabled(c)).count();
+        let (what, remedy) = match (all.len(), enabled) {
+            (0, _) => ("it has no cameras".to_owned(), "Export the cameras of a chunk with aligned photos."),
+            (n, 0) => (format!("all of its {n} cameras are disabled"), "Enable them, and export the cameras again."),
+            (_, n) => (
+                format!("none of its {n} enabled cameras has a pose"),
+                "Align the photos, and export the cameras again.",
+            ),
+        };
+        return Err(Error::input(what).remedy(remedy));
     }
+    let told = |c: &Node<'_, '_>| {
+        format!("{:.80} ({} cameras with poses)", c.attribute("label").unwrap_or("unnamed"), readable(*c))
+    };
+    let others: Vec<String> = chunks.iter().filter(|c| **c != chunk && readable(**c) > 0).map(told).collect();
+    if !others.is_empty() {
+        warnings.push(format!(
+            "The file has several chunks, each with a world of its own: {} is read, and {} not. To read another, export it alone.",
+            told(&chunk),
+            others.join(", ")
+        ));
+    }
+    Ok(chunk)
+}
+
+fn shots(document: &Document<'_>, images: &Images, warnings: &mut Vec<String>) -> Result<Vec<Shot>> {
+    let chunk = chunk(document, warnings)?;
     let mut sensors: BTreeMap<&str, Node<'_, '_>> = BTreeMap::new();
     sensors
         .extend(chunk.descendants().filter(|n| n.has_tag_name("sensor")).filter_map(|n| Some((n.attribute("id")?, n))));
@@ -87,19 +132,11 @@ fn shots(document: &Document<'_>, images: &Images, warnings: &mut Vec<String>) -
             components.insert(id, similarity(t)?);
         }
     }
-    let cameras: Vec<Node<'_, '_>> = chunk
-        .descendants()
-        // Keyframes of animations are cameras too, without a sensor.
-        .filter(|n| n.has_tag_name("camera") && n.attribute("sensor_id").is_some())
-        .collect();
+    let cameras: Vec<Node<'_, '_>> = cameras(chunk).collect();
     let (mut out, mut bare) = (Vec::new(), 0);
-    for camera in &cameras {
+    for camera in cameras.iter().filter(|c| is_enabled(c)) {
         let label = camera.attribute("label").unwrap_or_default();
-        let off = |name: &str| camera.attribute(name).is_some_and(|v| v == "0" || v == "false");
-        if off("enabled") {
-            continue;
-        }
-        let Some(transform) = elements(*camera, "transform").next() else {
+        let Some(transform) = pose_of(*camera) else {
             bare += 1;
             continue;
         };
@@ -158,6 +195,10 @@ fn optics(sensor: Node<'_, '_>) -> Result<Optics> {
         let Some(node) = elements(*calibration, name).next() else { return Ok(0.0) };
         Ok(numbers::<1>(node)?[0])
     };
+    if elements(*calibration, "f").next().is_none() {
+        return Err(Error::input("its sensor's calibration has no focal length (f)")
+            .remedy("Align the photos, and export the cameras again."));
+    }
     let f = term("f")?;
     if term("b2")?.abs() > MAX_SKEW {
         return Err(Error::new(ErrorKind::Unsupported, format!("its pixels are skewed (b2 = {})", term("b2")?))

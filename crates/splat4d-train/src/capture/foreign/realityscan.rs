@@ -17,6 +17,15 @@ pub(super) const EXPORT: Export = Export { find, is, read };
 
 /// Columns that such a file has.
 const COLUMNS: [&str; 10] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py"];
+/// How many of them a file has at least, in one of so many first lines, which is meant to be such a file.
+const MEANT: usize = 7;
+const HEADER_LINES: usize = 5;
+/// Other names of columns.
+const ALIASES: [(&str, &str); 3] = [("z", "alt"), ("altitude", "alt"), ("f35", "f")];
+/// Files of an ending that are looked into.
+const MOST_FILES: usize = 100;
+/// Endings of such files.
+const ENDINGS: [&str; 2] = ["csv", "txt"];
 /// Width of the film that lengths refer to, millimetres.
 const FILM: f64 = 36.0;
 /// Bytes at the beginning of a file in which its columns are named.
@@ -24,17 +33,33 @@ const HEAD: usize = 1024;
 const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 fn find(root: &Path) -> Option<PathBuf> {
-    let csv = rig::file_names(root).into_iter().filter(|n| n.to_lowercase().ends_with(".csv"));
-    csv.map(|n| root.join(n)).find(|p| is(p))
+    let names = rig::file_names(root);
+    let of = |ending: &'static str| {
+        let ends = move |p: &PathBuf| p.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending));
+        names.iter().map(|n| root.join(n)).filter(ends).take(MOST_FILES)
+    };
+    ENDINGS.into_iter().flat_map(of).find(|p| is(p))
 }
 
 fn is(path: &Path) -> bool {
     use std::io::Read;
+    if path.extension().is_none_or(|e| !ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v))) {
+        return false;
+    }
     let mut head = Vec::new();
     let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD as u64).read_to_end(&mut head).is_ok());
     let text = text::decode(&head).unwrap_or_else(|_| String::from_utf8_lossy(&head));
-    let columns = columns(text.lines().next().unwrap_or_default());
-    read && COLUMNS.iter().all(|c| columns.contains_key(*c))
+    read && header(&text).is_some()
+}
+
+/// The line that names the columns, and its number from 0: some versions write a line with the number of cameras before it.
+fn header(text: &str) -> Option<(usize, &str)> {
+    let known = |line: &str| {
+        let columns = columns(line);
+        COLUMNS.iter().filter(|c| columns.contains_key(**c)).count()
+    };
+    let lines = text.lines().enumerate().take(HEADER_LINES);
+    lines.map(|(number, line)| (number, line.trim())).find(|(_, line)| known(line) >= MEANT)
 }
 
 /// Separators of cells: spreadsheets of countries with decimal commas write semicolons or tabs.
@@ -45,15 +70,20 @@ fn separator(header: &str) -> char {
 /// Names of columns and their places.
 fn columns(line: &str) -> BTreeMap<String, usize> {
     let line = line.trim_start_matches('\u{feff}').trim_start_matches('#');
-    line.split(separator(line)).enumerate().map(|(i, name)| (name.trim().trim_matches('"').to_lowercase(), i)).collect()
+    let plain = |name: &str| {
+        let name = name.trim().trim_matches('"').to_lowercase();
+        ALIASES.iter().find(|(alias, _)| *alias == name).map_or(name, |(_, known)| (*known).to_owned())
+    };
+    line.split(separator(line)).enumerate().map(|(i, name)| (plain(name), i)).collect()
 }
 
 fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let bytes = json::read_bytes(marker)?;
     let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let place = |e: Error| e.at(marker.display());
-    let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
-    let header = lines.next().map_or("", |l| l.1);
+    let (first, header) = header(&text).unwrap_or_default();
+    let lines = text.lines().enumerate().skip(first + 1).map(|(i, l)| (i + 1, l.trim()));
+    let lines = lines.filter(|(_, l)| !l.is_empty());
     let (columns, separator) = (columns(header), separator(header));
     let missing: Vec<&str> = COLUMNS.into_iter().filter(|c| !columns.contains_key(*c)).collect();
     if !missing.is_empty() {
@@ -63,6 +93,13 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCaptu
     let images = Images::below(root);
     let rows: Vec<(usize, Row<'_>)> =
         lines.map(|(number, line)| (number, Row { columns: &columns, words: words(line, separator) })).collect();
+    let cells = header.split(separator).count();
+    let filled = |row: &Row<'_>| row.words.iter().rposition(|w| !w.is_empty()).map_or(0, |last| last + 1);
+    if let Some((number, row)) = rows.iter().find(|(_, row)| filled(row) > cells) {
+        let what = format!("expected {cells} cells, as there are columns, found {}", filled(row));
+        return Err(place(Error::input(what).at(format!("line {number}")))
+            .remedy("Where numbers have decimal commas, export the file with semicolons between cells."));
+    }
     let found =
         rows.iter().map(|(number, row)| images.named(row.name()).map_err(|e| place(e.at(format!("line {number}")))));
     let found = found.collect::<Result<Vec<PathBuf>>>()?;

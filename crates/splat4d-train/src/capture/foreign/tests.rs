@@ -118,6 +118,55 @@ fn metashape_cameras_round_trip() {
     assert_eq!(one_missing(&sample), "IMG_0008");
 }
 
+/// Chunks, cameras without poses, and what else a real project may hold.
+#[test]
+fn the_chunk_with_cameras_is_read_and_none_is_an_error() {
+    let sample = Sample::new(&["cameras.xml"]);
+    images(&sample, |i| format!("IMG_{i:04}.png"));
+    let camera = |i: usize, more: &str, posed: bool| {
+        let p = back(i);
+        let row =
+            |k: usize| format!("{} {} {} {}", p.rotation[k][0], p.rotation[k][1], p.rotation[k][2], p.translation[k]);
+        let transform = format!("<transform>{} {} {} 0 0 0 1</transform>", row(0), row(1), row(2));
+        let inner = if posed { transform.as_str() } else { "" };
+        format!("<camera id=\"{i}\" sensor_id=\"0\" label=\"IMG_{i:04}\" {more}>{inner}</camera>")
+    };
+    let all = |more: &str, posed: bool| (0..COUNT).map(|i| camera(i, more, posed)).collect::<String>();
+    let chunk = |label: &str, cameras: &str, calibration: &str| {
+        format!(
+            "<chunk label=\"{label}\"><sensors><sensor id=\"0\" type=\"frame\"><resolution width=\"{WIDTH}\" height=\"{HEIGHT}\"/>\
+             <calibration class=\"adjusted\">{calibration}</calibration></sensor></sensors><cameras>{cameras}</cameras></chunk>"
+        )
+    };
+    let f = format!("<f>{FOCAL}</f>");
+    let put = |chunks: &[String]| {
+        sample.write("cameras.xml", format!("<document version=\"2.0.0\">{}</document>", chunks.concat()).as_bytes());
+    };
+    // An empty chunk is no reason to read nothing, nor to warn.
+    put(&[chunk("empty", "", &f), chunk("full", &all("", true), &f)]);
+    let capture = open(&sample);
+    assert_eq!((capture.frames.len(), capture.warnings.len()), (COUNT, 0));
+    assert!(apart(&capture, samples::pose) < 1e-9);
+    // Of two with cameras the larger one is read, and both are named.
+    put(&[chunk("small", &camera(0, "", true), &f), chunk("large", &all("", true), &f)]);
+    let capture = open(&sample);
+    let said = capture.warnings.join(" ");
+    assert!(
+        capture.frames.len() == COUNT && said.contains("large (5 cameras") && said.contains("small (1 cameras"),
+        "{said}"
+    );
+    for (chunks, what) in [
+        (chunk("a", &all("enabled=\"false\"", true), &f), "all of its 5 cameras are disabled"),
+        (chunk("a", &all("", false), &f), "none of its 5 enabled cameras has a pose"),
+        (chunk("a", "", &f), "no cameras"),
+        (chunk("a", &all("", true), "<k1>0</k1>"), "no focal length"),
+    ] {
+        put(&[chunks]);
+        let text = refuse(&sample);
+        assert!(text.contains(what) && text.contains("cameras.xml"), "{text}");
+    }
+}
+
 #[test]
 fn realityscan_cameras_round_trip() {
     let sample = Sample::new(&["cameras.csv"]);
@@ -143,6 +192,26 @@ fn realityscan_cameras_round_trip() {
     assert!(off < 1e-9, "{off}");
     let k = capture.frames[0].source.intrinsics;
     assert!((k.fx - FOCAL).abs() < 1e-9 && (k.cx - 12.5).abs() < 1e-9 && (k.cy - 7.8).abs() < 1e-9, "{k:?}");
+    // A line with their number first, other names of columns, another ending.
+    let renamed = csv.replacen("alt", "z", 1).replacen("#name", "#cameras 5\n#Name", 1);
+    sample.write("cameras.csv", renamed.as_bytes());
+    assert_eq!(apart(&open(&sample), samples::pose), off);
+    std::fs::rename(sample.path("cameras.csv"), sample.path("cameras_rs.txt")).unwrap();
+    assert_eq!(apart(&open(&sample), samples::pose), off);
+    std::fs::remove_file(sample.path("cameras_rs.txt")).unwrap();
+    // A column that is missing, none at all, and decimal commas between commas.
+    for (text, what) in [
+        (csv.replacen("heading", "yaw", 1), "lacks the columns heading"),
+        (
+            csv.lines().skip(1).map(|l| format!("{l}\n")).collect(),
+            "table of images with numbers, without names of columns",
+        ),
+        (csv.replacen(".0", ",0", 1).replacen("0.", "0,", 5), "as there are columns"),
+    ] {
+        sample.write("cameras.csv", text.as_bytes());
+        let said = refuse(&sample);
+        assert!(said.contains(what) && said.contains("cameras.csv"), "{said}");
+    }
     // A spreadsheet with decimal commas.
     let other = csv.replace(',', ";").replace('.', ",").replace(",png", ".png");
     sample.write("cameras.csv", other.as_bytes());

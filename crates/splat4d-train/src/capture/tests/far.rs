@@ -111,6 +111,9 @@ fn panoramas_become_the_faces_of_a_cube() {
     assert!(capture.held.iter().all(|&i| i / 6 == 0 || i / 6 == 8), "whole panoramas are held out");
     assert_eq!(capture.cameras[1].name, "cam00/right");
     assert!(capture.notes.iter().any(|n| n.contains("9 panoramas")), "{:?}", capture.notes);
+    // Faces share the panorama's image, and none is without one.
+    let said = |w: &String| w.contains("another pose") || w.contains("left out");
+    assert!(!capture.warnings.iter().any(said), "{:?}", capture.warnings);
     let store = ImageStore::new(capture.clone(), 1 << 20);
     for face in 0..6 {
         let (view, loaded) = (&capture.frames[6 + face].view, store.load(6 + face).unwrap().to_picture());

@@ -128,6 +128,52 @@ fn workspaces_of_colmap_are_read_and_named() {
 }
 
 #[test]
+fn models_in_folders_of_other_names_are_read() {
+    let sample = colmap();
+    rename(&sample, "sparse/0", "sparse/geo");
+    assert_found(&open(&sample), 6);
+    // Several: the one with most images, and both are named.
+    for name in ["cameras.txt", "images.txt"] {
+        let text = std::fs::read(sample.path("sparse/geo").join(name)).unwrap();
+        sample.write(&format!("sparse/small/{name}"), &text);
+    }
+    let capture = open(&sample);
+    assert_found(&capture, 6);
+    assert!(capture.warnings.iter().any(|w| w.contains("There are 2 separate models")), "{:?}", capture.warnings);
+    std::fs::remove_dir_all(sample.path("sparse/small")).unwrap();
+    // A folder of results next to the images.
+    rename(&sample, "sparse", "output/sparse");
+    assert_found(&Capture::open(&sample.path("output"), &CaptureOptions::default()).unwrap(), 6);
+}
+
+#[test]
+fn projects_of_other_programs_are_named_with_the_way_out() {
+    let sample = photos();
+    for name in ["transforms.json", "points.ply"] {
+        let _ = std::fs::remove_file(sample.path(name));
+    }
+    std::fs::remove_dir_all(sample.path("sparse")).unwrap();
+    for (name, text, what) in [
+        ("room.psx", "<document/>", "project of Metashape: export its cameras"),
+        ("room.rcproj", "x", "project of RealityCapture: export the registration"),
+        ("model.nvm", "NVM_V3", "VisualSFM: export the cameras as COLMAP"),
+        ("blocks.xml", "<?xml version=\"1.0\"?><BlocksExchange/>", "BlocksExchange, which is not read"),
+        ("list.txt", "a.jpg 1 2 3 4 5 6\n", "table of images with numbers"),
+        ("bundle.out", "# Bundle", "Bundler reconstructions"),
+    ] {
+        sample.write(name, text.as_bytes());
+        assert_has(&refuse(sample.root()), &[name, what]);
+        std::fs::remove_file(sample.path(name)).unwrap();
+    }
+    // What is there is named, and the message is short.
+    std::fs::remove_dir_all(sample.path("images")).unwrap();
+    sample.write("notes/a.md", b"x");
+    let text = refuse(sample.root());
+    assert_has(&text, &["It holds", "notes", "transforms.json"]);
+    assert!(text.len() < 500, "{text}");
+}
+
+#[test]
 fn a_folder_near_a_capture_names_the_capture() {
     let sample = photos();
     assert_has(&refuse(&sample.path("images")), &["The folder that holds it is a capture"]);

@@ -158,7 +158,7 @@ fn read(
     }
     let frames = step * fps;
     if frames.is_finite() && frames >= MANY_FRAMES {
-        return doubt(Times::Seconds, format!("a step of {step} s is {frames:.0} frames at {fps} frames a second"));
+        return doubt(Times::Seconds, format!("a step of {step:.4} s is {frames:.0} frames at {fps} frames a second"));
     }
     // Cameras of a rig, whose shutters do not open at once, are compared each with itself.
     let own = 2.0 * half_frame(of_camera.iter().copied().zip(times.iter().copied()));
@@ -187,11 +187,15 @@ fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account
     let doubt = reading.doubt.as_ref().map_or_else(String::new, |d| {
         format!(" This is not sure: {d}. Otherwise use --set capture.times=seconds, fractions or frames.")
     });
+    // To the microsecond, without the digits of rounding.
+    let [first, last, span] = [*first, *last, last - first]
+        .map(|t| ((t * 1e6).round() / 1e6, t))
+        .map(|(short, t)| if t.abs() < 1e9 { short } else { t });
     let what = format!(
         "Times are read as {word}: {} times from {first} to {last} at {} frames a second ({from}): {:.3} s.{doubt}",
         instants.len(),
         reading.fps,
-        (last - first) * reading.scale
+        span * reading.scale
     );
     let severity = if doubt.is_empty() { Severity::Note } else { Severity::Warning };
     account.add(Aspect::Assumed, severity, what);

@@ -61,8 +61,8 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
-/// Nerfstudio's name for equirectangular panoramas, whose focal lengths carry no information.
-const PANORAMA: &str = "EQUIRECTANGULAR";
+/// Names for equirectangular panoramas, whose focal lengths say nothing: Nerfstudio's, and that of other programs.
+const PANORAMAS: [&str; 2] = ["EQUIRECTANGULAR", "SPHERICAL"];
 
 /// Scene units per stored number of a depth map where a file does not state it: thousandths, as in Nerfstudio.
 const DEPTH_UNIT: f64 = 1e-3;
@@ -94,7 +94,7 @@ fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, boo
     let cam_from_world = Convention::NERF.read_as(raw, file.poses)?;
     let (width, height) = size(file, node, image)?;
     let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
-    if model.is_some_and(|m| m.eq_ignore_ascii_case(PANORAMA)) {
+    if model.is_some_and(|m| PANORAMAS.iter().any(|name| m.eq_ignore_ascii_case(name))) {
         let (intrinsics, lens) = panorama::whole([width, height]);
         return Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, false));
     }
