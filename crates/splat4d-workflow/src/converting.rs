@@ -3,12 +3,13 @@
 use crate::baking::{self, Baking};
 use crate::events::Listener;
 use crate::files::{self, either, grouped, human_bytes};
+use crate::programs::Program;
 use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::bake::Likeness;
-use splat4d::format::dialect::{self, WriteOptions};
+use splat4d::format::dialect::{self, Axes, WriteOptions};
 use splat4d::format::linear::from_linear;
 use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
 use splat4d::layers::{self, Constant, Scene, rotation_between};
@@ -65,6 +66,8 @@ pub struct Conversion {
     pub linear: Vec<Linear>,
     /// Version of .spz to write.
     pub spz_version: u32,
+    /// Axes, unit and file names of this program; `frames` are `constant` then.
+    pub program: Option<Program>,
 }
 
 /// Which way is up in the file.
@@ -98,7 +101,7 @@ impl Target {
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
             Some("safetensors") => return Ok(Self::Scene),
             Some(playback::EXTENSION | playback::OLD_EXTENSION) => return Ok(Self::Playback),
-            Some("ksplat" | "4dgs" | "usdc" | "usd") => ("this format is not written", "Write .ply or .spz.".into()),
+            Some("usdc" | "usd") => ("this format is not written", "Write .ply or .spz.".into()),
             _ => {
                 ("has no ending that names a format", format!("Use {} .safetensors .s4d.", written(|_| true).join(" ")))
             }
@@ -142,7 +145,23 @@ impl Conversion {
             world: false,
             linear: Vec::new(),
             spz_version: spz::DEFAULT_VERSION,
+            program: None,
         }
+    }
+}
+
+impl Conversion {
+    /// Which way is up in a file: as the option says, else as the program expects it where the format leaves it open.
+    fn up_in(&self, target: Target) -> Up {
+        match (self.up, self.program, target) {
+            (Up::Format, Some(program), Target::Dialect(d)) if d.axes != Axes::Fixed => Up::Axis(program.up),
+            (up, ..) => up,
+        }
+    }
+
+    /// The program whose unit and handedness the numbers get: of a file that states none.
+    fn fitted(&self, target: Target) -> Option<Program> {
+        self.program.filter(|p| p.changes() && matches!(target, Target::Dialect(d) if d.axes == Axes::Custom))
     }
 }
 
@@ -194,6 +213,16 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
             .at(args.output.display())
             .remedy("Leave option `time` or option `frames` out."));
     }
+    if let (Some(program), Target::Dialect(dialect)) = (args.program, target)
+        && dialect.moves
+        && dialect.axes == Axes::Custom
+        && program.changes()
+    {
+        let what = format!("{} takes static files only: it is left-handed or has another unit", program.name);
+        return Err(Error::new(ErrorKind::Unsupported, what)
+            .at(args.output.display())
+            .remedy("Write .usdz, or numbered files with option `frames`."));
+    }
     Ok((pattern, target))
 }
 
@@ -211,7 +240,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     }
     let cameras = first_camera(&source);
     let compared = if target.moves() { baking::compared(&source)? } else { Vec::new() };
-    let rotation = rotate(&mut source.scene, args.up, target, console);
+    let rotation = rotate(&mut source.scene, args.up_in(target), target, console);
     let turned = |cameras: Vec<Camera>| cameras.into_iter().map(|c| rotated(c, &rotation)).collect::<Vec<_>>();
     let cameras = turned(cameras.into_iter().collect());
     let compared: Vec<(f64, Camera)> = compared.into_iter().map(|(t, c)| (t, rotated(c, &rotation))).collect();
@@ -241,6 +270,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     }
     let moment = match args.time {
         Some(time) => Some(time),
+        None if !target.moves() && args.fitted(target).is_some() && !scene.is_moving() => Some(scene.clip[0]),
         None if target.moves() || !scene.is_moving() => None,
         None => {
             let start = scene.clip[0];
@@ -255,7 +285,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let still;
     let whole = match moment {
         Some(time) => {
-            still = one_moment(scene, time)?;
+            still = one_moment(scene, time, args.fitted(target))?;
             console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
             &still
         }
@@ -337,7 +367,10 @@ fn frames_pattern(args: &Conversion) -> Result<Option<(Pattern, PathBuf)>> {
                 .at(args.output.display())
                 .remedy("Give a folder, or a pattern such as frames/f_%04d.spz."));
         }
-        None => Pattern::in_folder(&args.output),
+        None => match args.program {
+            Some(program) => Pattern::in_folder_as(&args.output, program.frame),
+            None => Pattern::in_folder(&args.output),
+        },
     };
     let example = pattern.file(0);
     Ok(Some((pattern, example)))
@@ -352,15 +385,18 @@ fn write_frames(
     console: &dyn Listener,
 ) -> Result<()> {
     let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
-    let mut constant = args.constant.then(|| Constant::new(scene, times.clone())).transpose()?;
+    let constant = args.constant || args.program.is_some();
+    let mut constant = constant.then(|| Constant::new(scene, times.clone())).transpose()?;
+    let program = args.fitted(writer.target);
     let read = sequence::Read { path: &args.input, run };
     let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;
     let mut total = 0;
     for (i, &time) in times.iter().enumerate() {
-        let params = match &mut constant {
+        let mut params = match &mut constant {
             Some(frames) => frames.frame(i).clone(),
             None => layers::moment(scene, Time(time))?,
         };
+        program.into_iter().for_each(|p| p.fit(&mut params));
         let place = |e: Error| e.at(format_args!("the frame at {time} s"));
         let (bytes, warnings) = writer.bytes(&standing(scene, params)).map_err(place)?;
         if i == 0 {
@@ -423,9 +459,11 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
     Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
 }
 
-/// A scene that is static as `scene` is at `time`.
-fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
-    layers::moment(scene, Time(time)).map(|params| standing(scene, params))
+/// A scene that is static as `scene` is at `time`, in the axes and unit of a program.
+fn one_moment(scene: &Scene<f32>, time: f64, program: Option<Program>) -> Result<Scene<f32>> {
+    let mut params = layers::moment(scene, Time(time))?;
+    program.into_iter().for_each(|p| p.fit(&mut params));
+    Ok(standing(scene, params))
 }
 
 /// Static Gaussians in the world of `scene`.

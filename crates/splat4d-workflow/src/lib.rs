@@ -76,6 +76,7 @@ mod picking;
 pub mod playable;
 pub mod point_queries;
 pub mod predicting;
+pub mod programs;
 pub mod raw_values;
 pub mod rendering;
 pub mod report;

@@ -5,8 +5,9 @@ use crate::files;
 use crate::sequence::newest;
 use crate::source::{Source, dialect_of};
 use splat4d::format::dialect::Opened;
+use splat4d::format::research::{self, Trained};
 use splat4d::format::sog::{self, levels};
-use splat4d::format::{Dialect, dialect, dynamic3d, gltf, zip};
+use splat4d::format::{Dialect, checkpoint, dialect, dynamic3d, gltf, zip};
 use splat4d::layers::Scene;
 use splat4d::scene::Params;
 use splat4d::{Error, Result};
@@ -18,6 +19,11 @@ use std::path::{Component, Path, PathBuf};
 /// 4DGaussians) or
 /// make them (Scaffold-GS).
 const NETWORKS: [&str; 4] = ["deformation.pth", "deform.pth", "opacity_mlp.pt", "checkpoints.pth"];
+
+/// Those of them that are read.
+const READ: [&str; 2] = ["deformation.pth", "deform.pth"];
+/// The settings of a training, in its folder.
+const SETTINGS: &str = "cfg_args";
 
 /// Deformable 3DGS's folder of networks, next to that of results.
 const DEFORM: &str = "deform";
@@ -32,7 +38,7 @@ pub fn is_scene(folder: &Path) -> bool {
 }
 
 /// Opens a folder of these kinds; none where it is no such folder.
-pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
+pub(crate) fn open(folder: &Path, fps: f64, clip: Option<[f64; 2]>) -> Result<Option<Source>> {
     if folder.join(levels::LEVELS).is_file() {
         return streamed(folder).map(Some);
     }
@@ -40,7 +46,7 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
         return Source::open_at(&folder.join(dynamic3d::NAME), fps).map(Some);
     }
     let Some((file, iteration)) = newest(folder) else { return Ok(None) };
-    let mut source = Source::open_at(&file, fps)?;
+    let mut source = Source::open_with(&file, fps, clip)?;
     if iteration.is_some() {
         source.warnings.say(format!("the newest iteration is read: {}", file.display()));
     }
@@ -59,8 +65,28 @@ pub(crate) fn network_of(file: &Path) -> Option<PathBuf> {
     folders.iter().flat_map(|folder| NETWORKS.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
+/// Opens Gaussians together with the network that moves them. `None`: there is none that is read.
+pub(crate) fn trained(path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Option<Result<Opened>> {
+    let network = network_of(path).filter(|n| n.file_name().is_some_and(|n| READ.iter().any(|r| n == *r)))?;
+    let full = std::path::absolute(path).ok()?;
+    // point_cloud/iteration_N/point_cloud.ply, or all files in one folder.
+    let folders = [full.ancestors().nth(3), full.parent()];
+    let settings = folders.into_iter().flatten().map(|f| f.join(SETTINGS)).find(|f| f.is_file());
+    let open = || {
+        let settings = settings.map_or(Ok(Vec::new()), |file| files::read(&file))?;
+        let settings = String::from_utf8_lossy(&settings);
+        let weights = files::read(&network)?;
+        let files = Trained { gaussians: bytes, network: &weights, settings: &settings };
+        research::read(files, clip).map_err(|e| e.at(network.display()))
+    };
+    Some(open())
+}
+
 /// Opens a file of a dialect, with the files next to it that a .gltf names.
-pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8]) -> Result<Opened> {
+pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
+    if kind == checkpoint::DIALECT {
+        return checkpoint::read_on(bytes, clip).map(|opened| kind.finish(opened));
+    }
     if kind != gltf::TEXT {
         return kind.open(bytes);
     }
@@ -211,12 +237,15 @@ mod tests {
         for network in ["point_cloud/iteration_30000/deformation.pth", "deform/iteration_30000/deform.pth"] {
             put(at, network, b"");
             for path in [at.to_path_buf(), at.join("point_cloud/iteration_30000/point_cloud.ply")] {
-                let said = Source::open(&path).unwrap().warnings;
+                let error = Source::open(&path).err().unwrap().to_string();
                 let name = Path::new(network).file_name().unwrap().to_str().unwrap();
-                assert!(said.lines().iter().any(|w| w.contains(name)), "{said:?}");
+                assert!(error.contains(name), "{error}");
             }
             std::fs::remove_file(at.join(network)).unwrap();
         }
+        put(at, "point_cloud/iteration_30000/opacity_mlp.pt", b"");
+        let said = Source::open(at).unwrap().warnings;
+        assert!(said.lines().iter().any(|w| w.contains("opacity_mlp.pt")), "{said:?}");
         let of_7000 = Source::open(&at.join("point_cloud/iteration_7000")).unwrap().warnings;
         assert!(!of_7000.lines().iter().any(|w| w.contains("network")), "{of_7000:?}");
     }

@@ -1,12 +1,14 @@
-//! Checkpoints of PyTorch with Gaussians in them, read: gsplat's trainer, nerfstudio's splatfacto, FreeTimeGsVanilla.
+//! Checkpoints of PyTorch with Gaussians in them, read: gsplat's trainer, nerfstudio's splatfacto, FreeTimeGsVanilla, and by
+//! `rotors` 3DGS and 4d-gaussian-splatting.
 //!
 //! gsplat: `splats` with means, quats (wxyz), scales (logarithms), opacities (logits), sh0 [N, 1, 3], shN [N, K, 3];
 //! FreeTimeGsVanilla adds times, durations and velocities (`freetime`). splatfacto: `pipeline` with
 //! `_model.gauss_params.` and the same names, but features_dc [N, 3], features_rest [N, K, 3].
 //! Sources: nerfstudio-project/gsplat, examples/simple_trainer.py; nerfstudio, models/splatfacto.py.
 
-use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
 use super::freetime::{self, Moves};
+use super::research::rotors;
 use super::torch::{Tensor, Torch, Value, is_torch};
 use super::warnings::Warnings;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -14,7 +16,7 @@ use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, ErrorKind, Result};
 
 /// Files of torch.save.
-pub(crate) const DIALECT: Dialect = Dialect {
+pub const DIALECT: Dialect = Dialect {
     name: "checkpoint of PyTorch",
     ending: ".pt",
     up: Y_DOWN,
@@ -23,6 +25,7 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read,
     writer: Writer::None("Write .ply, which gsplat and others load."),
     world: false,
+    axes: Axes::Custom,
 };
 
 /// Up in the world of nerfstudio.
@@ -33,8 +36,18 @@ const SPLATFACTO: &str = "_model.gauss_params.";
 const NAMED: usize = 8;
 
 fn read(bytes: &[u8]) -> Result<Opened> {
+    read_on(bytes, None)
+}
+
+/// Reads a checkpoint; of 4d-gaussian-splatting, whose clock has no seconds, with these as the first and last one.
+///
+/// Errors: damaged, no Gaussians that are read. [`Dialect::finish`] must follow.
+pub fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
     let torch = Torch::open(bytes)?;
     let root = torch.root();
+    if let Some(opened) = rotors::read(&torch, clip)? {
+        return Ok(opened);
+    }
     let mut warnings = Warnings::default();
     if let Some(pipeline) =
         torch.get(root, "pipeline").filter(|p| torch.get(p, &format!("{SPLATFACTO}means")).is_some())
@@ -49,7 +62,8 @@ fn read(bytes: &[u8]) -> Result<Opened> {
         let keys: Vec<&str> = torch.keys(root).into_iter().take(NAMED).collect();
         let what = format!("this checkpoint of PyTorch holds no Gaussians that are read; it has {}", keys.join(", "));
         return Err(Error::new(ErrorKind::Unsupported, what).remedy(
-            "Checkpoints of gsplat, splatfacto and FreeTimeGsVanilla are read. Export .ply from other programs.",
+            "Checkpoints of gsplat, splatfacto, FreeTimeGsVanilla, 3DGS and 4d-gaussian-splatting are read. \
+             Give the folder of 4DGaussians, Deformable-3D-Gaussians and SC-GS. Export .ply from other programs.",
         ));
     };
     let file = Tensors { torch: &torch, dict: splats, prefix: "" };

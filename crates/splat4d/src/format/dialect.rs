@@ -41,6 +41,19 @@ pub struct Dialect {
     pub writer: Writer,
     /// Whether it can be written with positions of the world, in double precision ([`WriteOptions::world`]).
     pub world: bool,
+    /// Who states its axes.
+    pub axes: Axes,
+}
+
+/// Who states the axes of a dialect's files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Axes {
+    /// No one: programs take the numbers as they are, or by custom.
+    Custom,
+    /// Each file states which way is up; programs rotate, and make them left-handed where they are themselves.
+    Stated,
+    /// The specification.
+    Fixed,
 }
 
 /// How a dialect is written. Writers say what was left out.
@@ -238,7 +251,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{checkpoint, dynamic3d, ply, splat, splatv, spz, usd};
+    use crate::format::{checkpoint, dynamic3d, ksplat, ply, splat, splats4d, splatv, spz, usd};
     use crate::scene::params::LOG_SCALE;
     use crate::scene::{GEOMETRY, SH};
 
@@ -253,6 +266,8 @@ mod tests {
         let by_hand = [
             (dynamic3d::DIALECT, dynamic3d::tests::sample(), 2),
             (checkpoint::DIALECT, checkpoint::tests::sample(&gaussians(20, 4)), 20),
+            (splats4d::DIALECT, splats4d::tests::sample(), 21),
+            (ksplat::DIALECT, ksplat::tests::sample(&gaussians(20, 4), 1, 1), 20),
         ];
         for dialect in DIALECTS {
             let (scene, mut bytes, mut count) = (sample(dialect.moves), Vec::new(), 20);

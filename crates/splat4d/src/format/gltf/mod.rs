@@ -12,7 +12,7 @@ mod read;
 pub(super) mod tests;
 mod write;
 
-use super::dialect::{Dialect, Writer, Y_UP};
+use super::dialect::{Axes, Dialect, Writer, Y_UP};
 use crate::{Error, ErrorKind};
 pub use read::{buffers_of, read_text};
 
@@ -28,6 +28,7 @@ pub const DIALECT: Dialect = Dialect {
         write::plain(params).and_then(|(file, warnings)| file.write_binary(&mut out).map(|()| warnings))
     }),
     world: false,
+    axes: Axes::Fixed,
 };
 
 /// The same as JSON.

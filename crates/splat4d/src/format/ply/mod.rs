@@ -11,13 +11,14 @@ mod compressed;
 mod filter;
 mod ftgs;
 mod header;
+mod numbered;
 mod pack;
 mod rows;
 mod stg;
 
 use crate::format::bytes::SH_C0;
 pub use crate::format::dialect::PlyInfo;
-use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
+use crate::format::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
 use crate::format::linear;
 use crate::format::mend::{FLAT, Mended};
 use crate::format::warnings::Warnings;
@@ -33,6 +34,7 @@ use std::io::Write;
 
 pub use compressed::COMPRESSED;
 pub(crate) use ftgs::FTGS;
+pub(in crate::format) use numbered::numbered;
 pub(crate) use pack::write_compressed;
 pub use stg::{STG, write_stg};
 
@@ -49,6 +51,7 @@ pub const DIALECT: Dialect = Dialect {
         write_placed(params, offset, &mut out).map(|()| Warnings::default())
     }),
     world: true,
+    axes: Axes::Custom,
 };
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.
