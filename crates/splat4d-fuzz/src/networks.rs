@@ -3,7 +3,7 @@
 use crate::Reader;
 use crate::zip::zip;
 use splat4d::format::ply;
-use splat4d::format::research::{self, Trained};
+use splat4d::format::research;
 use splat4d::scene::{GEOMETRY, Params};
 
 pub(crate) const READERS: &[Reader] = &[
@@ -142,9 +142,7 @@ fn gaussians() -> Vec<u8> {
 
 /// Reads a network next to Gaussians, and as a checkpoint.
 fn network(bytes: &[u8]) {
-    let gaussians = gaussians();
-    let files = Trained { gaussians: &gaussians, network: bytes, settings: "" };
-    if let Ok(opened) = research::read(files, Some([0.0, 1.0])) {
+    if let Ok(opened) = research::read(&gaussians(), bytes, "", Some([0.0, 1.0])) {
         crate::formats::show(&opened.scene);
     }
     crate::formats::open(bytes);
@@ -159,8 +157,7 @@ mod tests {
         let all = networks();
         let gaussians = gaussians();
         for network in &all[..3] {
-            let files = Trained { gaussians: &gaussians, network, settings: "" };
-            research::read(files, None).unwrap_or_else(|e| panic!("{e}"));
+            research::read(&gaussians, network, "", None).unwrap_or_else(|e| panic!("{e}"));
         }
         assert_eq!(splat4d::open(&all[3]).unwrap_or_else(|e| panic!("{e}")).len(), ROWS);
     }

@@ -9,7 +9,7 @@ use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::bake::Likeness;
-use splat4d::format::dialect::{self, Axes, WriteOptions};
+use splat4d::format::dialect::{self, WriteOptions};
 use splat4d::format::linear::from_linear;
 use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
 use splat4d::layers::{self, Constant, Scene, rotation_between};
@@ -95,7 +95,10 @@ impl Target {
     fn of(path: &Path) -> Result<Self> {
         let name = path.file_name().map(|n| n.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         if let Some(dialect) = Dialect::by_ending(&name) {
-            dialect.check_written().map_err(|e| e.at(path.display()))?;
+            if let dialect::Writer::None(remedy) = dialect.writer {
+                let what = format!("{} is read, but not written", dialect.name);
+                return Err(Error::new(ErrorKind::Unsupported, what).at(path.display()).remedy(remedy));
+            }
             return Ok(Self::Dialect(dialect));
         }
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
@@ -154,14 +157,9 @@ impl Conversion {
     /// Which way is up in a file: as the option says, else as the program expects it where the format leaves it open.
     fn up_in(&self, target: Target) -> Up {
         match (self.up, self.program, target) {
-            (Up::Format, Some(program), Target::Dialect(d)) if d.axes != Axes::Fixed => Up::Axis(program.up),
+            (Up::Format, Some(program), Target::Dialect(d)) if !d.fixed_axes => Up::Axis(program.up),
             (up, ..) => up,
         }
-    }
-
-    /// The program whose unit and handedness the numbers get: of a file that states none.
-    fn fitted(&self, target: Target) -> Option<Program> {
-        self.program.filter(|p| p.changes() && matches!(target, Target::Dialect(d) if d.axes == Axes::Custom))
     }
 }
 
@@ -213,16 +211,6 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
             .at(args.output.display())
             .remedy("Leave option `time` or option `frames` out."));
     }
-    if let (Some(program), Target::Dialect(dialect)) = (args.program, target)
-        && dialect.moves
-        && dialect.axes == Axes::Custom
-        && program.changes()
-    {
-        let what = format!("{} takes static files only: it is left-handed or has another unit", program.name);
-        return Err(Error::new(ErrorKind::Unsupported, what)
-            .at(args.output.display())
-            .remedy("Write .usdz, or numbered files with option `frames`."));
-    }
     Ok((pattern, target))
 }
 
@@ -256,6 +244,8 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
         cameras,
         exact: args.exact,
         world: args.world,
+        units: args.program.map_or(1.0, |p| p.units),
+        mirrored: args.program.and_then(|p| p.mirrored),
         ..WriteOptions::default()
     };
     let writer = Writer { target, options };
@@ -270,7 +260,6 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     }
     let moment = match args.time {
         Some(time) => Some(time),
-        None if !target.moves() && args.fitted(target).is_some() && !scene.is_moving() => Some(scene.clip[0]),
         None if target.moves() || !scene.is_moving() => None,
         None => {
             let start = scene.clip[0];
@@ -285,7 +274,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let still;
     let whole = match moment {
         Some(time) => {
-            still = one_moment(scene, time, args.fitted(target))?;
+            still = one_moment(scene, time)?;
             console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
             &still
         }
@@ -387,16 +376,14 @@ fn write_frames(
     let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
     let constant = args.constant || args.program.is_some();
     let mut constant = constant.then(|| Constant::new(scene, times.clone())).transpose()?;
-    let program = args.fitted(writer.target);
     let read = sequence::Read { path: &args.input, run };
     let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;
     let mut total = 0;
     for (i, &time) in times.iter().enumerate() {
-        let mut params = match &mut constant {
+        let params = match &mut constant {
             Some(frames) => frames.frame(i).clone(),
             None => layers::moment(scene, Time(time))?,
         };
-        program.into_iter().for_each(|p| p.fit(&mut params));
         let place = |e: Error| e.at(format_args!("the frame at {time} s"));
         let (bytes, warnings) = writer.bytes(&standing(scene, params)).map_err(place)?;
         if i == 0 {
@@ -459,11 +446,9 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
     Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
 }
 
-/// A scene that is static as `scene` is at `time`, in the axes and unit of a program.
-fn one_moment(scene: &Scene<f32>, time: f64, program: Option<Program>) -> Result<Scene<f32>> {
-    let mut params = layers::moment(scene, Time(time))?;
-    program.into_iter().for_each(|p| p.fit(&mut params));
-    Ok(standing(scene, params))
+/// A scene that is static as `scene` is at `time`.
+fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
+    layers::moment(scene, Time(time)).map(|params| standing(scene, params))
 }
 
 /// Static Gaussians in the world of `scene`.

@@ -1,9 +1,5 @@
 //! Axes, units and file names that other programs expect of numbered files and scenes (`convert --for`).
 
-use splat4d::layers::mirror;
-use splat4d::scene::params::LOG_SCALE;
-use splat4d::scene::{GEOMETRY, Params};
-
 /// A program and what its importers take for granted.
 ///
 /// Files that state their axes (USD, .spz) only get `up`, and glTF nothing: importers convert them.
@@ -40,25 +36,6 @@ impl Program {
     pub fn of(name: &str) -> Option<Self> {
         PROGRAMS.into_iter().find(|p| p.name == name)
     }
-
-    /// Whether numbers change by more than a rotation.
-    pub(crate) fn changes(&self) -> bool {
-        self.mirrored.is_some() || self.units != 1.0
-    }
-
-    /// Gives static Gaussians, whose up is already the program's, its unit and handedness.
-    pub(crate) fn fit(&self, params: &mut Params) {
-        let (units, log) = (self.units as f32, self.units.ln() as f32);
-        let table = &mut params[GEOMETRY];
-        for row in (0..table.rows()).filter(|_| self.units != 1.0) {
-            let mean = table.read::<3>(row, 0);
-            table.write(row, 0, mean.map(|x| x * units));
-            table.add(row, LOG_SCALE, [log; 3]);
-        }
-        if let Some(axis) = self.mirrored {
-            mirror(params, axis);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -68,6 +45,8 @@ mod tests {
     use crate::events::ignore;
     use splat4d::format::{dialect, ply, scene, usd};
     use splat4d::layers::Scene;
+    use splat4d::scene::params::LOG_SCALE;
+    use splat4d::scene::{GEOMETRY, Params};
 
     /// A small Gaussian one unit above another one, a third one to the right of it and a fourth one in front (y is up, x right,
     /// −z front), turned about the vertical.
@@ -144,6 +123,6 @@ mod tests {
         run(&conversion, &ignore).unwrap();
         assert!(frames.join("frame.0000.ply").is_file());
         let error = run(&Conversion { program, ..Conversion::new(&input, dir.path().join("a.splatv")) }, &ignore);
-        assert!(error.unwrap_err().to_string().contains("unreal"));
+        assert!(error.unwrap_err().to_string().contains("mirrored"));
     }
 }

@@ -8,8 +8,8 @@ use crate::paths::{Stage, View};
 use crate::run_folder::{Run, check_written};
 use crate::sequence;
 use splat4d::format::playback::{self, Index, Provenance};
-use splat4d::format::ply::{self, PlyInfo};
-use splat4d::format::{Dialect, Warnings, dialect, foreign, research, sog};
+use splat4d::format::ply::PlyInfo;
+use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
@@ -116,10 +116,10 @@ impl Source {
         }
         let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
         let kind = dialect_of(path, &bytes);
-        let trained = match kind.filter(|k| *k == ply::DIALECT).and_then(|_| bundle::trained(path, &bytes, clip)) {
+        let trained = match kind.and_then(|kind| bundle::trained(kind, path, &bytes, clip)) {
             Some(Ok(opened)) => {
                 return Ok(Self {
-                    dialect: Some(research::DIALECT),
+                    dialect: Some(bundle::with_network()),
                     warnings: opened.warnings,
                     ..Self::own(opened.scene)
                 });

@@ -7,7 +7,7 @@ use crate::source::{Source, dialect_of};
 use splat4d::format::dialect::Opened;
 use splat4d::format::research::{self, Trained};
 use splat4d::format::sog::{self, levels};
-use splat4d::format::{Dialect, checkpoint, dialect, dynamic3d, gltf, zip};
+use splat4d::format::{Dialect, checkpoint, dialect, dynamic3d, gltf, ply, zip};
 use splat4d::layers::Scene;
 use splat4d::scene::Params;
 use splat4d::{Error, Result};
@@ -22,6 +22,8 @@ const NETWORKS: [&str; 4] = ["deformation.pth", "deform.pth", "opacity_mlp.pt", 
 
 /// Those of them that are read.
 const READ: [&str; 2] = ["deformation.pth", "deform.pth"];
+/// Ending of checkpoints, which may hold Gaussians on a clock without seconds.
+const CHECKPOINT: &str = ".pt";
 /// The settings of a training, in its folder.
 const SETTINGS: &str = "cfg_args";
 
@@ -65,8 +67,18 @@ pub(crate) fn network_of(file: &Path) -> Option<PathBuf> {
     folders.iter().flat_map(|folder| NETWORKS.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
+/// What Gaussians with a network are called, where a dialect is named.
+pub(crate) fn with_network() -> Dialect {
+    let mut dialect = ply::DIALECT;
+    (dialect.name, dialect.moves) = ("Gaussians with their network", true);
+    dialect
+}
+
 /// Opens Gaussians together with the network that moves them. `None`: there is none that is read.
-pub(crate) fn trained(path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Option<Result<Opened>> {
+pub(crate) fn trained(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Option<Result<Opened>> {
+    if kind != ply::DIALECT {
+        return None;
+    }
     let network = network_of(path).filter(|n| n.file_name().is_some_and(|n| READ.iter().any(|r| n == *r)))?;
     let full = std::path::absolute(path).ok()?;
     // point_cloud/iteration_N/point_cloud.ply, or all files in one folder.
@@ -76,16 +88,15 @@ pub(crate) fn trained(path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Opti
         let settings = settings.map_or(Ok(Vec::new()), |file| files::read(&file))?;
         let settings = String::from_utf8_lossy(&settings);
         let weights = files::read(&network)?;
-        let files = Trained { gaussians: bytes, network: &weights, settings: &settings };
-        research::read(files, clip).map_err(|e| e.at(network.display()))
+        research::read(bytes, &weights, &settings, clip).map_err(|e| e.at(network.display()))
     };
     Some(open())
 }
 
 /// Opens a file of a dialect, with the files next to it that a .gltf names.
 pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
-    if kind == checkpoint::DIALECT {
-        return checkpoint::read_on(bytes, clip).map(|opened| kind.finish(opened));
+    if kind.ending == CHECKPOINT {
+        return research::read(&[], bytes, "", clip);
     }
     if kind != gltf::TEXT {
         return kind.open(bytes);
@@ -95,7 +106,7 @@ pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[
         let file = within(path, &from_uri(&uri))?;
         buffers.insert(uri, files::read(&file)?);
     }
-    gltf::read_text(bytes, &buffers).map(|opened| kind.finish(opened))
+    gltf::read_text(bytes, &buffers)
 }
 
 /// A file's name of a relative URI, whose percent codes are bytes of UTF-8 (RFC 3986).
@@ -205,7 +216,6 @@ fn within(index: &Path, name: &str) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::format::ply;
     use std::io::Write;
 
     fn ply_of(rows: usize) -> Vec<u8> {

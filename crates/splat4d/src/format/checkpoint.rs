@@ -6,9 +6,9 @@
 //! `_model.gauss_params.` and the same names, but features_dc [N, 3], features_rest [N, K, 3].
 //! Sources: nerfstudio-project/gsplat, examples/simple_trainer.py; nerfstudio, models/splatfacto.py.
 
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::freetime::{self, Moves};
-use super::research::rotors;
+use super::rotors;
 use super::torch::{Tensor, Torch, Value, is_torch};
 use super::warnings::Warnings;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -16,7 +16,7 @@ use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, ErrorKind, Result};
 
 /// Files of torch.save.
-pub const DIALECT: Dialect = Dialect {
+pub(crate) const DIALECT: Dialect = Dialect {
     name: "checkpoint of PyTorch",
     ending: ".pt",
     up: Y_DOWN,
@@ -25,7 +25,8 @@ pub const DIALECT: Dialect = Dialect {
     read,
     writer: Writer::None("Write .ply, which gsplat and others load."),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Up in the world of nerfstudio.
@@ -42,7 +43,7 @@ fn read(bytes: &[u8]) -> Result<Opened> {
 /// Reads a checkpoint; of 4d-gaussian-splatting, whose clock has no seconds, with these as the first and last one.
 ///
 /// Errors: damaged, no Gaussians that are read. [`Dialect::finish`] must follow.
-pub fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
+pub(super) fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
     let torch = Torch::open(bytes)?;
     let root = torch.root();
     if let Some(opened) = rotors::read(&torch, clip)? {

@@ -6,7 +6,7 @@
 //! a second, those of its captures, are assumed. Source: JonathonLuiten/Dynamic3DGaussians (MIT), README and helpers.py.
 
 use super::bytes::SH_C0;
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::npy::Npy;
 use super::warnings::Warnings;
 use super::zip;
@@ -28,7 +28,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::None("Write .stg.ply, .ftgs.ply or .usdz."),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// The file's usual name.

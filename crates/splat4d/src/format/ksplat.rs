@@ -6,7 +6,7 @@
 //! Source: mkkellogg/GaussianSplats3D (MIT), src/loaders/SplatBuffer.js, version 0.1, read for facts.
 
 use super::bytes::{dc_of_byte, f32_at, logit_of_byte};
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::half::f16_to_f32;
 use super::warnings::Warnings;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -23,7 +23,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::None("Write .ply, .spz 2 or .splat, which GaussianSplats3D opens as well."),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Bytes of the header and of a section's.

@@ -27,6 +27,7 @@ pub mod playback;
 pub mod ply;
 pub mod quant;
 pub mod research;
+mod rotors;
 pub mod safetensors;
 #[cfg(test)]
 mod samples;

@@ -4,7 +4,7 @@
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
 
 use super::bytes::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, scale_of_log, sound_rows};
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -22,7 +22,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moment(|params, _, mut out| write(params, &mut out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Bytes a Gaussian.

@@ -6,7 +6,7 @@
 //! Source: adamraudonis/splats4D (MIT), docs/FORMAT.md, version 1.
 
 use super::bytes::{Cursor, dc_of_byte, logit_of_byte};
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::inflate::zstd;
 use super::sequence;
 use super::warnings::Warnings;
@@ -28,7 +28,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::None("Write numbered .splat files (--frames --constant), which that program encodes."),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 const MAGIC: &[u8] = b"SP4D";

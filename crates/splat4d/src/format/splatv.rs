@@ -8,7 +8,7 @@
 //! Source: antimatter15/splaTV and gsplat.js (MIT), their shaders.
 
 use super::bytes::{Cursor, byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte};
-use super::dialect::{Axes, Dialect, Opened, WriteOptions, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, WriteOptions, Writer, Y_DOWN};
 use super::half::{f16_to_f32, f32_to_f16};
 use super::kinematic::{Clock, Moving, rows, scene};
 use super::warnings::Warnings;
@@ -28,7 +28,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write(scene, options, &mut out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// First four bytes.

@@ -7,7 +7,7 @@ use crate::scene::{GEOMETRY, Params, SH};
 const ODD: [[usize; 6]; 3] = [[3, 4, 7, 10, 13, 15], [1, 4, 5, 9, 10, 11], [2, 5, 7, 10, 12, 14]];
 
 /// Mirrors means, rotations and spherical harmonics along axis 0, 1 or 2. Panics: another axis.
-pub fn mirror(params: &mut Params, axis: usize) {
+pub(crate) fn mirror(params: &mut Params, axis: usize) {
     let [geometry, sh] = params.get_mut([GEOMETRY, SH]);
     for row in 0..geometry.rows() {
         geometry.set(row, axis, -geometry.get(row, axis));

@@ -21,7 +21,7 @@ pub use convert::{to_native4d, to_spacetime};
 pub use evaluation::Evaluation;
 pub(crate) use evaluation::sweep;
 pub use freeze::{Gaussians, freeze, freeze_rows, moment};
-pub use mirror::mirror;
+pub(crate) use mirror::mirror;
 pub use rotate::rotation_between;
 
 use crate::math::{Real, Rng, Sim3};

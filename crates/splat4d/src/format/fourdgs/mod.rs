@@ -14,7 +14,7 @@ mod streams;
 pub(super) mod tests;
 mod write;
 
-use super::dialect::{Axes, Dialect, Writer, Y_DOWN};
+use super::dialect::{Dialect, Writer, Y_DOWN};
 use crate::Error;
 
 /// .4dgs of the fourdgs libraries.
@@ -27,7 +27,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read: read::read,
     writer: Writer::Moving(|scene, options, out| write::write(scene, options, out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// First and last bytes.

@@ -10,7 +10,7 @@ use super::header::{Element, Header, broken};
 use super::pack::{BOUNDS, CHUNK, COLOR_BOUNDS, SH_RANGE, WORDS};
 use super::{PlyInfo, degree, is_compressed, non_finite, open, rows, surplus, write_compressed};
 use crate::format::bytes::{SH_C0, logit_of_byte};
-use crate::format::dialect::{Axes, Dialect, Writer, Y_DOWN};
+use crate::format::dialect::{Dialect, Writer, Y_DOWN};
 use crate::format::mend::Mended;
 use crate::scene::params::{GEOMETRY, LOG_SCALE, OPACITY, Params, QUAT, SH};
 use crate::scene::table::Table;
@@ -26,7 +26,8 @@ pub const COMPRESSED: Dialect = Dialect {
     read: open,
     writer: Writer::Moment(|params, _, mut out| write_compressed(params, &mut out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Whether the element holds packed Gaussians.

@@ -8,7 +8,7 @@
 use super::header::{Element, Header};
 use super::stg::{CLOCK, clock};
 use super::{F_REST_COUNTS, GEOMETRY_NAMES, NORMAL_NAMES, rows};
-use crate::format::dialect::{Axes, Dialect, Opened, WriteOptions, Writer, Y_DOWN};
+use crate::format::dialect::{Dialect, Opened, WriteOptions, Writer, Y_DOWN};
 use crate::format::freetime::{self, Moves, SHORTEST};
 use crate::format::kinematic::{Clock, rows as moving_rows};
 use crate::format::warnings::Warnings;
@@ -29,7 +29,8 @@ pub(crate) const FTGS: Dialect = Dialect {
     read: read_ftgs,
     writer: Writer::Moving(|scene, options, mut out| write_ftgs(scene, options, &mut out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Properties in addition to those of a plain file.

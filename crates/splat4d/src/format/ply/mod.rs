@@ -18,7 +18,7 @@ mod stg;
 
 use crate::format::bytes::SH_C0;
 pub use crate::format::dialect::PlyInfo;
-use crate::format::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use crate::format::linear;
 use crate::format::mend::{FLAT, Mended};
 use crate::format::warnings::Warnings;
@@ -51,7 +51,8 @@ pub const DIALECT: Dialect = Dialect {
         write_placed(params, offset, &mut out).map(|()| Warnings::default())
     }),
     world: true,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.

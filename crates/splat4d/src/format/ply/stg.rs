@@ -11,7 +11,7 @@ use super::{NORMAL_NAMES, rows};
 use crate::Error;
 use crate::Result;
 use crate::format::bytes::SH_C0;
-use crate::format::dialect::{Axes, Dialect, Opened, WriteOptions, Writer, Y_DOWN};
+use crate::format::dialect::{Dialect, Opened, WriteOptions, Writer, Y_DOWN};
 use crate::format::kinematic::{Clock, Moving, rows as moving_rows, scene};
 use crate::format::warnings::Warnings;
 use crate::layers::Scene;
@@ -27,7 +27,8 @@ pub const STG: Dialect = Dialect {
     read: |bytes| read_stg(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write_stg(scene, options, &mut out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Numbers of a row as [`names`] lists them.

@@ -12,13 +12,13 @@
 mod control_nodes;
 mod deform;
 mod hexplane;
-pub(super) mod rotors;
 mod settings;
 mod state;
 #[cfg(test)]
 mod tests;
 
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::checkpoint;
+use super::dialect::{Opened, Y_DOWN};
 use super::ply;
 use super::warnings::Warnings;
 use crate::layers::{Layer, Scene};
@@ -30,33 +30,20 @@ use settings::Settings;
 use state::State;
 use std::sync::Arc;
 
-/// What these files are called where a dialect is named. It stands in no list: they are no single file.
-pub const DIALECT: Dialect = Dialect {
-    name: "Gaussians with their network",
-    ending: ".pth",
-    up: Y_DOWN,
-    moves: true,
-    mark: None,
-    read: |_| Err(unsupported("a network without its Gaussians").remedy("Give the folder of the training.")),
-    writer: Writer::None("Write .s4d or a sequence of .ply."),
-    world: false,
-    axes: Axes::Custom,
-};
-
 /// Clip of files without seconds.
 const UNKNOWN_CLIP: [f64; 2] = [0.0, 1.0];
 /// Upwards in Blender's worlds, in which the synthetic captures are.
 const BLENDER_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 /// The files of one training.
-#[derive(Clone, Copy, Debug)]
-pub struct Trained<'a> {
+#[derive(Clone, Copy)]
+struct Trained<'a> {
     /// `point_cloud.ply`.
-    pub gaussians: &'a [u8],
+    gaussians: &'a [u8],
     /// `deformation.pth` or `deform.pth`.
-    pub network: &'a [u8],
+    network: &'a [u8],
     /// `cfg_args`, the settings as Python writes them; empty: the programs' defaults are assumed.
-    pub settings: &'a str,
+    settings: &'a str,
 }
 
 /// What a reader gets.
@@ -84,10 +71,19 @@ const PROGRAMS: [Program; 3] = [
     Program { name: "Deformable-3D-Gaussians", known: deform::KNOWN, read: deform::read },
 ];
 
-/// Reads Gaussians with their network; `clip`: first and last second, where these are known.
+/// Reads what a training left: `gaussians` (`point_cloud.ply`) and the `network` (`deformation.pth`, `deform.pth`) that moves them,
+/// with the text of its `cfg_args` (empty: the programs' defaults are assumed). Without `gaussians`, `network` is a checkpoint
+/// that holds them. `clip`: first and last second, where these are known.
 ///
 /// Errors: damaged files; networks of other programs, or with parts that are not read (`Unsupported`).
-pub fn read(files: Trained<'_>, clip: Option<[f64; 2]>) -> Result<Opened> {
+pub fn read(gaussians: &[u8], network: &[u8], settings: &str, clip: Option<[f64; 2]>) -> Result<Opened> {
+    if gaussians.is_empty() {
+        return checkpoint::read_on(network, clip).map(|opened| checkpoint::DIALECT.finish(opened));
+    }
+    read_trained(Trained { gaussians, network, settings }, clip)
+}
+
+fn read_trained(files: Trained<'_>, clip: Option<[f64; 2]>) -> Result<Opened> {
     let clip = clip.filter(|[from, to]| to > from);
     let state = State::open(files.network)?;
     let Some(program) = PROGRAMS.iter().find(|p| state.shape(p.known).is_some()) else {
@@ -112,7 +108,7 @@ pub fn read(files: Trained<'_>, clip: Option<[f64; 2]>) -> Result<Opened> {
     let scene =
         Scene { layers: vec![layer], clip: job.clip, fps: DEFAULT_FPS, offset: info.offset, ..Scene::default() };
     let opened = Opened { up: Some(up), ..Opened::from((scene, warnings)) };
-    Ok(ply::DIALECT.finish(opened))
+    Ok(checkpoint::DIALECT.finish(opened))
 }
 
 fn unsupported(what: impl Into<String>) -> Error {

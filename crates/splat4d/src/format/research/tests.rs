@@ -198,18 +198,19 @@ fn feature_planes_of_4dgaussians_are_evaluated_as_there() {
     let (ply, network) = (ply_of(&params), net.file());
     for (settings, all) in [("Namespace(no_do=False, no_dshs=False)", true), ("", false)] {
         let files = Trained { gaussians: &ply, network: &network, settings };
-        let opened = read(files, Some([2.0, 5.0])).unwrap();
+        let opened = read_trained(files, Some([2.0, 5.0])).unwrap();
         assert_eq!((opened.scene.clip, opened.scene.up), ([2.0, 5.0], Y_DOWN));
         assert_eq!(opened.warnings.lines().iter().any(|w| w.contains("cfg_args")), settings.is_empty());
         check(&opened.scene, |row, t| hexplane_says(&net, &params, row, t, all));
     }
     for settings in ["Namespace(static_mlp=True)", "Namespace(x=1, apply_rotation=True)"] {
-        let error = read(Trained { gaussians: &ply, network: &network, settings }, None).unwrap_err();
+        let error = read_trained(Trained { gaussians: &ply, network: &network, settings }, None).unwrap_err();
         assert!(error.kind() == ErrorKind::Unsupported && error.to_string().contains("=True"), "{error}");
     }
     let mut other = net.clone();
     other.map(&format!("{PREFIX}feature_out.0"), 3 * CHANNELS * SIDES.len(), 12, 1.0);
-    let error = read(Trained { gaussians: &ply, network: &other.file(), settings: "" }, None).unwrap_err().to_string();
+    let error =
+        read_trained(Trained { gaussians: &ply, network: &other.file(), settings: "" }, None).unwrap_err().to_string();
     assert!(error.contains("96 inputs"), "{error}");
 }
 
@@ -270,7 +271,7 @@ fn perceptrons_of_deformable_gaussians_are_evaluated_as_there() {
         let net = perceptron("", time_net, heads);
         let network = net.file();
         let settings = "Namespace(is_blender=True, sh_degree=3)";
-        let opened = read(Trained { gaussians: &ply, network: &network, settings }, None).unwrap();
+        let opened = read_trained(Trained { gaussians: &ply, network: &network, settings }, None).unwrap();
         assert_eq!((opened.scene.up, opened.scene.clip), (BLENDER_UP, UNKNOWN_CLIP));
         assert!(opened.warnings.lines().iter().any(|w| w.contains("one second")));
         check(&opened.scene, |row, t| {
@@ -331,7 +332,8 @@ fn control_nodes_of_sc_gs_are_evaluated_as_there() {
     for (local, masked) in [(true, false), (false, true)] {
         let net = nodes_net(local);
         let (ply, network) = (ply_with(&params, HYPER + usize::from(masked), feature), net.file());
-        let opened = read(Trained { gaussians: &ply, network: &network, settings: "Namespace(K=3)" }, None).unwrap();
+        let opened =
+            read_trained(Trained { gaussians: &ply, network: &network, settings: "Namespace(K=3)" }, None).unwrap();
         check(&opened.scene, |row, t| {
             let g = params[GEOMETRY].read::<11>(row, 0).map(f64::from);
             let place = |k: usize, c: usize| net.get("nodes", k * (3 + HYPER) + c);
@@ -375,11 +377,12 @@ fn control_nodes_of_sc_gs_are_evaluated_as_there() {
     }
     let network = nodes_net(true).file();
     let ply = ply_with(&params, HYPER + 2, feature);
-    let error = read(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap_err().to_string();
+    let error =
+        read_trained(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap_err().to_string();
     assert!(error.contains("4 features") && error.contains("2 hyper"), "{error}");
     let ply = ply_with(&params, HYPER, feature);
     let settings = "Namespace(use_hash=True)";
-    let error = read(Trained { gaussians: &ply, network: &network, settings }, None).unwrap_err().to_string();
+    let error = read_trained(Trained { gaussians: &ply, network: &network, settings }, None).unwrap_err().to_string();
     assert!(error.contains("use_hash=True"), "{error}");
 }
 
@@ -388,7 +391,7 @@ fn control_nodes_of_sc_gs_are_evaluated_as_there() {
 #[test]
 fn scenes_of_networks_are_written_and_read_again() {
     let (ply, network) = (ply_with(&cloud(), HYPER, |row, i| (row + i) as f32 * 0.1), nodes_net(true).file());
-    let opened = read(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap();
+    let opened = read_trained(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap();
     let mut bytes = Vec::new();
     crate::format::scene::write(&opened.scene, &mut bytes).unwrap();
     let again = crate::format::scene::read(&bytes).unwrap();
@@ -402,7 +405,7 @@ fn hostile_and_damaged_networks_are_refused() {
     let ply = ply_with(&params, HYPER, |_, _| 0.1);
     let refused = |net: &Net| {
         let network = net.file();
-        read(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap_err().to_string()
+        read_trained(Trained { gaussians: &ply, network: &network, settings: "" }, None).unwrap_err().to_string()
     };
     let mut nothing = Net::default();
     nothing.add("weight", &[1], 1.0);
@@ -410,7 +413,7 @@ fn hostile_and_damaged_networks_are_refused() {
     // A function instead of a tensor.
     let call = b"X\x05\0\0\0nodescposix\nsystem\nX\x02\0\0\0ls\x85R";
     let hostile = saved(Some("x"), &[], call);
-    assert!(read(Trained { gaussians: &ply, network: &hostile, settings: "" }, None).is_err());
+    assert!(read_trained(Trained { gaussians: &ply, network: &hostile, settings: "" }, None).is_err());
     for (name, shape) in
         [("nodes", vec![NODES * 5]), ("nodes", vec![NODES, 2]), ("nodes", vec![0, 5]), ("_node_radius", vec![2, 3])]
     {
@@ -434,7 +437,7 @@ fn hostile_and_damaged_networks_are_refused() {
     }
     for net in [hexplane_net(), nodes_net(false), perceptron("", false, &[("gaussian_warp", 3)])] {
         for network in mutants(&net.file(), 60, "research") {
-            let _ = read(Trained { gaussians: &ply, network: &network, settings: "" }, None);
+            let _ = read_trained(Trained { gaussians: &ply, network: &network, settings: "" }, None);
         }
     }
 }

@@ -14,7 +14,7 @@ pub(super) mod tests;
 mod write;
 
 use super::bytes::logit_of_byte;
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::foreign;
 use super::warnings::Warnings;
 use super::zip;
@@ -36,7 +36,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(&unzip(bytes)?).map(Opened::from),
     writer: Writer::Moment(|params, _, out| write::write(params, out)),
     world: false,
-    axes: Axes::Custom,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// The version this library reads.

@@ -17,7 +17,7 @@ mod tests;
 
 use super::bytes::sound_rows;
 pub use super::dialect::SPZ_VERSION as DEFAULT_VERSION;
-use super::dialect::{Axes, Dialect, Opened, Writer, Y_DOWN};
+use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;
 use crate::scene::{Params, SH};
@@ -37,7 +37,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     },
     writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, options.up, &mut out)),
     world: false,
-    axes: Axes::Stated,
+    fixed_axes: false,
+    states_up: true,
 };
 
 /// The versions this library reads and writes.

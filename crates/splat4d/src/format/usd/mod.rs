@@ -15,7 +15,7 @@ mod tests;
 mod transform;
 mod write;
 
-use super::dialect::{Axes, Dialect, Opened, WriteOptions, Writer, Y_UP};
+use super::dialect::{Dialect, Opened, WriteOptions, Writer, Y_UP};
 use super::warnings::Warnings;
 use super::zip;
 use crate::layers::Scene;
@@ -32,7 +32,8 @@ pub(crate) const TEXT: Dialect = Dialect {
     read: |bytes| scene::opened(&stage::Stage::read(bytes)?),
     writer: Writer::Moving(write::write),
     world: false,
-    axes: Axes::Stated,
+    fixed_axes: false,
+    states_up: true,
 };
 
 /// An archive with one such layer.

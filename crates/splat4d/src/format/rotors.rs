@@ -1,22 +1,21 @@
 //! Checkpoints of 3DGS (Kerbl et al. 2023) and of 4d-gaussian-splatting (Yang et al. 2024, Fudan), read: a tuple of a training's
-//! tensors without names, of which the number of entries tells the program.
+//! tensors without names, whose length identifies the program.
 //!
 //! Gaussians of space and time become [`crate::motion::native4d`]. Their rotation X ↦ l X r̄ has X = t + zi + yj + xk, ours
 //! t + xi + yj + zk: swapping i and k reverses products, so that our left quaternion is their right one with x and z swapped,
 //! conjugated, and the other way round. Their renderer leaves out what has faded below 0.05, ours below 1/255 of opacity.
 //! Sources: graphdeco-inria/gaussian-splatting and fudan-zvg/4d-gaussian-splatting (MIT), scene/gaussian_model.py, read for facts.
 
-use super::super::dialect::{Opened, Y_DOWN};
-use super::super::torch::{Torch, Value};
-use super::super::warnings::Warnings;
-use super::unsupported;
+use super::dialect::{Opened, Y_DOWN};
+use super::torch::{Torch, Value};
+use super::warnings::Warnings;
 use crate::layers::{Layer, Scene};
 use crate::motion::native4d::{LONGEST, MAX_HARMONICS, Native4dSpec, SHORTEST, TABLE};
 use crate::motion::{Spec, build};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::time::DEFAULT_FPS;
 use crate::scene::{GEOMETRY, LifeKind, Params, SH};
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 
 /// Entries of the tuple of 3DGS and of 4d-gaussian-splatting.
 const STATIC: usize = 12;
@@ -36,7 +35,7 @@ const OUTSIDE: f64 = 0.01;
 /// Reads a checkpoint; `clip`: first and last second, where these are known. `None`: it is of another program.
 ///
 /// Errors: tensors of other shapes, settings that are not read.
-pub(in crate::format) fn read(torch: &Torch<'_>, clip: Option<[f64; 2]>) -> Result<Option<Opened>> {
+pub(super) fn read(torch: &Torch<'_>, clip: Option<[f64; 2]>) -> Result<Option<Opened>> {
     let root = torch.items(torch.root());
     let entries = root.first().map(|tuple| torch.items(tuple)).unwrap_or_default();
     if root.len() != 2 || ![STATIC, MOVING].contains(&entries.len()) || !matches!(entries[1], Value::Tensor(_)) {
@@ -97,6 +96,10 @@ fn range_of(times: &[f32]) -> [f64; 2] {
     let (Some(low), Some(high)) = (all.get(out), all.get(all.len().wrapping_sub(1 + out))) else { return [0.0, 1.0] };
     let length = ((high - low) / SPREAD).round().clamp(1.0, LONGEST);
     if (low + high).abs() < 0.5 * length { [-0.5 * length, 0.5 * length] } else { [0.0, length] }
+}
+
+fn unsupported(what: impl Into<String>) -> Error {
+    Error::new(ErrorKind::Unsupported, what)
 }
 
 /// Entries of the tuple.
