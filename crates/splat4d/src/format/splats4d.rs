@@ -138,6 +138,8 @@ impl State {
         let section = bytes.get(header.base..).ok_or_else(|| damaged("its base lies outside the file"))?;
         let mut c = Cursor::new(section, "base of .splat4d");
         let mut stream = |count: usize| {
+            // Attribute and kind stand here as well, which the page of the format leaves out.
+            c.take(2)?;
             let (width, found, length) = (c.u8()?, c.u32()? as usize, c.u32()? as usize);
             if found != count {
                 return Err(damaged(format!("a stream of {found} symbols, expected {count}")));
@@ -314,7 +316,7 @@ pub(super) mod tests {
         let moving: Vec<usize> = (0..ROWS).step_by(4).collect();
         let mut base = Vec::new();
         let put = |out: &mut Vec<u8>, (width, count, bytes): (u8, usize, Vec<u8>)| {
-            out.push(width);
+            out.extend([0, 2, width]);
             out.extend((count as u32).to_le_bytes());
             out.extend((bytes.len() as u32).to_le_bytes());
             out.extend(bytes);
