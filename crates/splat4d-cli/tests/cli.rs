@@ -20,6 +20,8 @@ mod import;
 mod predict;
 #[path = "cli/sample.rs"]
 mod sample;
+#[path = "cli/trained.rs"]
+mod trained;
 
 use sample::{Capture, Output, splat4d};
 use serde_json::{Value, json};

@@ -3,6 +3,7 @@
 use crate::baking::{self, Baking};
 use crate::events::Listener;
 use crate::files::{self, either, grouped, human_bytes};
+use crate::programs::Program;
 use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
@@ -65,6 +66,8 @@ pub struct Conversion {
     pub linear: Vec<Linear>,
     /// Version of .spz to write.
     pub spz_version: u32,
+    /// Axes, unit and file names of this program; `frames` are `constant` then.
+    pub program: Option<Program>,
 }
 
 /// Which way is up in the file.
@@ -92,13 +95,16 @@ impl Target {
     fn of(path: &Path) -> Result<Self> {
         let name = path.file_name().map(|n| n.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         if let Some(dialect) = Dialect::by_ending(&name) {
-            dialect.check_written().map_err(|e| e.at(path.display()))?;
+            if let dialect::Writer::None(remedy) = dialect.writer {
+                let what = format!("{} is read, but not written", dialect.name);
+                return Err(Error::new(ErrorKind::Unsupported, what).at(path.display()).remedy(remedy));
+            }
             return Ok(Self::Dialect(dialect));
         }
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
             Some("safetensors") => return Ok(Self::Scene),
             Some(playback::EXTENSION | playback::OLD_EXTENSION) => return Ok(Self::Playback),
-            Some("ksplat" | "4dgs" | "usdc" | "usd") => ("this format is not written", "Write .ply or .spz.".into()),
+            Some("usdc" | "usd") => ("this format is not written", "Write .ply or .spz.".into()),
             _ => {
                 ("has no ending that names a format", format!("Use {} .safetensors .s4d.", written(|_| true).join(" ")))
             }
@@ -142,6 +148,17 @@ impl Conversion {
             world: false,
             linear: Vec::new(),
             spz_version: spz::DEFAULT_VERSION,
+            program: None,
+        }
+    }
+}
+
+impl Conversion {
+    /// Which way is up in a file: as the option says, else as the program expects it where the format leaves it open.
+    fn up_in(&self, target: Target) -> Up {
+        match (self.up, self.program, target) {
+            (Up::Format, Some(program), Target::Dialect(d)) if !d.fixed_axes => Up::Axis(program.up),
+            (up, ..) => up,
         }
     }
 }
@@ -211,7 +228,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     }
     let cameras = first_camera(&source);
     let compared = if target.moves() { baking::compared(&source)? } else { Vec::new() };
-    let rotation = rotate(&mut source.scene, args.up, target, console);
+    let rotation = rotate(&mut source.scene, args.up_in(target), target, console);
     let turned = |cameras: Vec<Camera>| cameras.into_iter().map(|c| rotated(c, &rotation)).collect::<Vec<_>>();
     let cameras = turned(cameras.into_iter().collect());
     let compared: Vec<(f64, Camera)> = compared.into_iter().map(|(t, c)| (t, rotated(c, &rotation))).collect();
@@ -227,6 +244,8 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
         cameras,
         exact: args.exact,
         world: args.world,
+        units: args.program.map_or(1.0, |p| p.units),
+        mirrored: args.program.and_then(|p| p.mirrored),
         ..WriteOptions::default()
     };
     let writer = Writer { target, options };
@@ -337,7 +356,10 @@ fn frames_pattern(args: &Conversion) -> Result<Option<(Pattern, PathBuf)>> {
                 .at(args.output.display())
                 .remedy("Give a folder, or a pattern such as frames/f_%04d.spz."));
         }
-        None => Pattern::in_folder(&args.output),
+        None => match args.program {
+            Some(program) => Pattern::in_folder_as(&args.output, program.frame),
+            None => Pattern::in_folder(&args.output),
+        },
     };
     let example = pattern.file(0);
     Ok(Some((pattern, example)))
@@ -352,7 +374,8 @@ fn write_frames(
     console: &dyn Listener,
 ) -> Result<()> {
     let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
-    let mut constant = args.constant.then(|| Constant::new(scene, times.clone())).transpose()?;
+    let constant = args.constant || args.program.is_some();
+    let mut constant = constant.then(|| Constant::new(scene, times.clone())).transpose()?;
     let read = sequence::Read { path: &args.input, run };
     let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;
     let mut total = 0;

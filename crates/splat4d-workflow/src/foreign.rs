@@ -58,7 +58,9 @@ pub fn score(
     for (name, value) in wanted {
         value.map_or(Ok(()), |value| recipe.set(&format!("{name}={value}")))?;
     }
-    let source = Source::open(path)?.finite();
+    let on = open_capture(capture, &recipe)?;
+    let (first, last) = on.time_range();
+    let source = Source::open_on(path, [first, last])?.finite();
     not_empty(&source.scene, path)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     if let Some(run) = &source.run {
@@ -76,17 +78,7 @@ pub fn score(
     });
     let folder = folder.transpose()?;
     let out = folder.as_ref().map(OutputFolder::path);
-    foreign_scores(
-        source.scene,
-        &open_capture(capture, &recipe)?,
-        &recipe,
-        out,
-        options.measured,
-        options.backgrounds,
-        measure,
-        stop,
-        console,
-    )?;
+    foreign_scores(source.scene, &on, &recipe, out, options.measured, options.backgrounds, measure, stop, console)?;
     if let Some(folder) = folder {
         folder.finished();
     }

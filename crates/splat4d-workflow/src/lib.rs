@@ -34,7 +34,7 @@
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
-//! | `converting.rs`, `exporting.rs` | formats of other programs; .ply files, a page, tracks |
+//! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
 //! | `localising.rs` | pose and time of images |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
@@ -76,6 +76,7 @@ mod picking;
 pub mod playable;
 pub mod point_queries;
 pub mod predicting;
+pub mod programs;
 pub mod raw_values;
 pub mod rendering;
 pub mod report;

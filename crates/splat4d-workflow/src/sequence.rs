@@ -55,7 +55,12 @@ impl Pattern {
 
     /// Frames of a folder that gave no pattern.
     pub fn in_folder(folder: &Path) -> Self {
-        let pattern = Self::of(&folder.join(DEFAULT_NAME)).expect("the default name is a pattern");
+        Self::in_folder_as(folder, DEFAULT_NAME)
+    }
+
+    /// The same with other names. Panics: `name` is no pattern.
+    pub fn in_folder_as(folder: &Path, name: &str) -> Self {
+        let pattern = Self::of(&folder.join(name)).expect("the name is a pattern");
         Self { whole: true, ..pattern }
     }
 

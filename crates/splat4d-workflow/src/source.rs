@@ -13,7 +13,7 @@ use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
-use splat4d::{Error, Result, format};
+use splat4d::{Error, ErrorKind, Result, format};
 use splat4d_train::output::{Input, check_file, check_free};
 use std::path::Path;
 
@@ -90,6 +90,15 @@ impl Source {
 
     /// The same; a sequence of files has `fps` a second.
     pub fn open_at(path: &Path, fps: f64) -> Result<Self> {
+        Self::open_with(path, fps, None)
+    }
+
+    /// The same; models of other programs, whose clock has no seconds, get this clip: that of the capture they were trained on.
+    pub fn open_on(path: &Path, clip: [f64; 2]) -> Result<Self> {
+        Self::open_with(path, DEFAULT_FPS, Some(clip))
+    }
+
+    fn open_with(path: &Path, fps: f64, clip: Option<[f64; 2]>) -> Result<Self> {
         if !path.exists() && sequence::Pattern::of(path).is_some() {
             return open_sequence(path, fps);
         }
@@ -98,7 +107,7 @@ impl Source {
             if path.join(sog::META).is_file() {
                 return bundle::open_sog(path);
             }
-            return bundle::open(path, fps)?.map_or_else(|| open_sequence(path, fps), Ok);
+            return bundle::open(path, fps, clip)?.map_or_else(|| open_sequence(path, fps), Ok);
         }
         if path.is_dir() {
             let run = Run::open(path)?;
@@ -110,7 +119,7 @@ impl Source {
             return bundle::open_sog(folder);
         }
         if path.file_name().is_some_and(|n| n == sog::levels::LEVELS) {
-            return bundle::open(folder, fps).map(|s| s.expect("the folder has the file"));
+            return bundle::open(folder, fps, clip).map(|s| s.expect("the folder has the file"));
         }
         let bytes = files::read(path)?;
         if bytes.starts_with(&playback::MAGIC) {
@@ -123,8 +132,21 @@ impl Source {
             return Ok(source);
         }
         let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
-        let opened = match dialect_of(path, &bytes) {
-            Some(kind) => bundle::open_file(kind, path, &bytes).map(|o| Self {
+        let kind = dialect_of(path, &bytes);
+        let trained = match kind.and_then(|kind| bundle::trained(kind, path, &bytes, clip)) {
+            Some(Ok(opened)) => {
+                return Ok(Self {
+                    dialect: Some(bundle::with_network()),
+                    warnings: opened.warnings,
+                    ..Self::own(opened.scene)
+                });
+            }
+            Some(Err(error)) if error.kind() != ErrorKind::Unsupported => return Err(error),
+            Some(Err(error)) => Some(error),
+            None => None,
+        };
+        let opened = match kind {
+            Some(kind) => bundle::open_file(kind, path, &bytes, clip).map(|o| Self {
                 ply: o.ply,
                 dialect: Some(kind),
                 warnings: o.warnings,
@@ -137,8 +159,9 @@ impl Source {
         };
         let mut source = opened.map_err(|e| e.at(path.display()))?;
         if let Some(network) = bundle::network_of(path).filter(|_| source.ply.is_some()) {
+            let why = trained.map_or(String::new(), |e| format!(" ({})", e.cause()));
             source.warnings.add(format!(
-                "{} belongs to these Gaussians: a network that splat4d does not read moves or generates them, so this is not \
+                "{} belongs to these Gaussians: a network that splat4d does not read{why} moves or generates them, so this is not \
                  the scene as trained. Export it as a sequence of .ply files",
                 network.display()
             ));

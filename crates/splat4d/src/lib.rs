@@ -48,6 +48,7 @@
 //! | `format/` | readers and writers of bytes: `scene.safetensors`, .npy; in `mod.rs` the one list of dialects, each a file or folder with a line there; archives (`zip.rs`), fitted temporal opacity (`fade.rs`), formats that are only recognised (`foreign.rs`) |
 //! | `format/playback/` | `.s4d`: index, pages of quantised Gaussians, palette (docs/format.md) |
 //! | `format/ply/`, `format/spz/`, `format/sog/` | 3DGS, compressed and Spacetime .ply; .spz 2 to 4 with its axes; SOG, zipped or as files, streamed |
+//! | `format/research/`, `format/fourdgs/` | networks of research code next to their Gaussians, as the motion models that have their equations; .4dgs: records and streams of bins |
 //! | `format/gltf/`, `format/usd/` | glTF with KHR_gaussian_splatting, also with an .spz inside; USD's ParticleField3DGaussianSplat as text or archive, with time samples |
 //! | `bake/` | any motion model to linear segments in a tree of time spans, within a byte budget or an error, and the comparison with the model |
 //! | `play.rs`, `play/` | plays a scene or file on the CPU: active set, pages within a memory budget |

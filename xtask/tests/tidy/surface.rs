@@ -60,6 +60,8 @@ const ADDITIONS: [(&str, &[&str], &[&str]); 4] = [
         &[
             "crates/splat4d-train/src/methods/hexplane.rs",
             "crates/splat4d-train/src/methods/mod.rs",
+            // Networks of 4DGaussians become this model: a reader, which an addition does not need.
+            "crates/splat4d/src/format/research/hexplane.rs",
             "crates/splat4d/src/motion/hexplane.rs",
             "crates/splat4d/src/motion/mod.rs",
         ],

@@ -1,10 +1,12 @@
 //! `convert`: from any scene to the formats of other programs; see [`converting`].
 
 use crate::console::Console;
+use clap::builder::PossibleValuesParser;
 use splat4d::format::dialect;
 use splat4d::format::{DIALECTS, Linear, spz};
 use splat4d_workflow::converting::{self, Conversion, written};
 use splat4d_workflow::files::either;
+use splat4d_workflow::programs::{PROGRAMS, Program};
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -16,6 +18,7 @@ Examples:
   splat4d convert runs/knight now.spz --time 0.5      one time
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
   splat4d convert runs/knight 'frames/f_%04d.ply' --frames --constant     for interpolation and motion blur
+  splat4d convert runs/knight 'take/' --frames --for unreal               z up, centimetres, left-handed
   splat4d convert runs/knight knight.usdz             USD with time samples
   splat4d convert frames/ all.safetensors --fps 25    numbered files become one dynamic scene
   splat4d convert runs/field field.ply --world        positions in the capture's map
@@ -85,6 +88,9 @@ pub(crate) struct Args {
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
+    /// Axes, unit and file names of this program; with --frames also --constant
+    #[arg(long = "for", value_name = "PROGRAM", value_parser = PossibleValuesParser::new(PROGRAMS.map(|p| p.name)))]
+    program: Option<String>,
 }
 
 /// Which axis is up.
@@ -155,6 +161,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         world: args.world,
         linear: args.linear.iter().map(linear).collect(),
         spz_version: args.spz_version,
+        program: args.program.as_deref().and_then(Program::of),
     };
     Ok(converting::run(&conversion, console)?)
 }

@@ -14,7 +14,7 @@ use splat4d_workflow::capture_page;
 use splat4d_workflow::editor::{self, Editor};
 use splat4d_workflow::playable::Playable;
 use splat4d_workflow::run_folder::Run;
-use splat4d_workflow::source::{Source, not_empty};
+use splat4d_workflow::source::{Source, bundle, not_empty};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -85,8 +85,9 @@ fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
     if is_metadata(path) {
         return open_capture(path, &Recipe::default()).map(Some);
     }
-    // The reader of scenes reports what is wrong with a folder that is neither.
-    Ok(if path.is_dir() && !Run::is(path) { open_capture(path, &Recipe::default()).ok() } else { None })
+    // What is wrong with a folder that is neither is said by the reader of scenes.
+    let maybe = path.is_dir() && !Run::is(path) && !bundle::is_scene(path);
+    Ok(if maybe { open_capture(path, &Recipe::default()).ok() } else { None })
 }
 
 /// A page with the cameras, images and points of a capture.

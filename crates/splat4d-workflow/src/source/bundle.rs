@@ -5,8 +5,9 @@ use crate::files;
 use crate::sequence::newest;
 use crate::source::{Source, dialect_of};
 use splat4d::format::dialect::Opened;
+use splat4d::format::research;
 use splat4d::format::sog::{self, levels};
-use splat4d::format::{Dialect, dialect, dynamic3d, gltf, zip};
+use splat4d::format::{Dialect, dialect, dynamic3d, gltf, ply, zip};
 use splat4d::layers::Scene;
 use splat4d::scene::Params;
 use splat4d::{Error, Result};
@@ -18,6 +19,13 @@ use std::path::{Component, Path, PathBuf};
 /// 4DGaussians) or
 /// make them (Scaffold-GS).
 const NETWORKS: [&str; 4] = ["deformation.pth", "deform.pth", "opacity_mlp.pt", "checkpoints.pth"];
+
+/// Those of them that are read.
+const READ: [&str; 2] = ["deformation.pth", "deform.pth"];
+/// Ending of checkpoints, which may hold Gaussians on a clock without seconds.
+const CHECKPOINT: &str = ".pt";
+/// The settings of a training, in its folder.
+const SETTINGS: &str = "cfg_args";
 
 /// Deformable 3DGS's folder of networks, next to that of results.
 const DEFORM: &str = "deform";
@@ -32,7 +40,7 @@ pub fn is_scene(folder: &Path) -> bool {
 }
 
 /// Opens a folder of these kinds; none where it is no such folder.
-pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
+pub(crate) fn open(folder: &Path, fps: f64, clip: Option<[f64; 2]>) -> Result<Option<Source>> {
     if folder.join(levels::LEVELS).is_file() {
         return streamed(folder).map(Some);
     }
@@ -40,7 +48,7 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
         return Source::open_at(&folder.join(dynamic3d::NAME), fps).map(Some);
     }
     let Some((file, iteration)) = newest(folder) else { return Ok(None) };
-    let mut source = Source::open_at(&file, fps)?;
+    let mut source = Source::open_with(&file, fps, clip)?;
     if iteration.is_some() {
         source.warnings.add(format!("the newest iteration is read: {}", file.display()));
     }
@@ -59,8 +67,37 @@ pub(crate) fn network_of(file: &Path) -> Option<PathBuf> {
     folders.iter().flat_map(|folder| NETWORKS.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
+/// What Gaussians with a network are called, where a dialect is named.
+pub(crate) fn with_network() -> Dialect {
+    let mut dialect = ply::DIALECT;
+    (dialect.name, dialect.moves) = ("Gaussians with their network", true);
+    dialect
+}
+
+/// Opens Gaussians together with the network that moves them. `None`: there is none that is read.
+pub(crate) fn trained(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Option<Result<Opened>> {
+    if kind != ply::DIALECT {
+        return None;
+    }
+    let network = network_of(path).filter(|n| n.file_name().is_some_and(|n| READ.iter().any(|r| n == *r)))?;
+    let full = std::path::absolute(path).ok()?;
+    // point_cloud/iteration_N/point_cloud.ply, or all files in one folder.
+    let folders = [full.ancestors().nth(3), full.parent()];
+    let settings = folders.into_iter().flatten().map(|f| f.join(SETTINGS)).find(|f| f.is_file());
+    let open = || {
+        let settings = settings.map_or(Ok(Vec::new()), |file| files::read(&file))?;
+        let settings = String::from_utf8_lossy(&settings);
+        let weights = files::read(&network)?;
+        research::read(bytes, &weights, &settings, clip).map_err(|e| e.at(network.display()))
+    };
+    Some(open())
+}
+
 /// Opens a file of a dialect, with the files next to it that a .gltf names.
-pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8]) -> Result<Opened> {
+pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
+    if kind.ending == CHECKPOINT {
+        return research::read(&[], bytes, "", clip);
+    }
     if kind != gltf::TEXT {
         return kind.open(bytes);
     }
@@ -69,7 +106,7 @@ pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8]) -> Result<Open
         let file = within(path, &from_uri(&uri))?;
         buffers.insert(uri, files::read(&file)?);
     }
-    gltf::read_text(bytes, &buffers).map(|opened| kind.finish(opened))
+    gltf::read_text(bytes, &buffers)
 }
 
 /// A file's name of a relative URI, whose percent codes are bytes of UTF-8 (RFC 3986).
@@ -179,7 +216,6 @@ fn within(index: &Path, name: &str) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::format::ply;
     use std::io::Write;
 
     fn ply_of(rows: usize) -> Vec<u8> {
@@ -211,12 +247,15 @@ mod tests {
         for network in ["point_cloud/iteration_30000/deformation.pth", "deform/iteration_30000/deform.pth"] {
             put(at, network, b"");
             for path in [at.to_path_buf(), at.join("point_cloud/iteration_30000/point_cloud.ply")] {
-                let said = Source::open(&path).unwrap().warnings;
+                let error = Source::open(&path).err().unwrap().to_string();
                 let name = Path::new(network).file_name().unwrap().to_str().unwrap();
-                assert!(said.lines().iter().any(|w| w.contains(name)), "{said:?}");
+                assert!(error.contains(name), "{error}");
             }
             std::fs::remove_file(at.join(network)).unwrap();
         }
+        put(at, "point_cloud/iteration_30000/opacity_mlp.pt", b"");
+        let said = Source::open(at).unwrap().warnings;
+        assert!(said.lines().iter().any(|w| w.contains("opacity_mlp.pt")), "{said:?}");
         let of_7000 = Source::open(&at.join("point_cloud/iteration_7000")).unwrap().warnings;
         assert!(!of_7000.lines().iter().any(|w| w.contains("network")), "{of_7000:?}");
     }

@@ -29,6 +29,11 @@ impl<'a> Cursor<'a> {
         Ok(head)
     }
 
+    /// Bytes that follow.
+    pub(super) fn left(&self) -> usize {
+        self.rest.len()
+    }
+
     fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
         Ok(*self.take(N)?.first_chunk().expect("that many bytes were taken"))
     }

@@ -1,4 +1,5 @@
-//! Checkpoints of PyTorch with Gaussians in them, read: gsplat's trainer, nerfstudio's splatfacto, FreeTimeGsVanilla.
+//! Checkpoints of PyTorch with Gaussians in them, read: gsplat's trainer, nerfstudio's splatfacto, FreeTimeGsVanilla, and by
+//! `rotors` 3DGS and 4d-gaussian-splatting.
 //!
 //! gsplat: `splats` with means, quats (wxyz), scales (logarithms), opacities (logits), sh0 [N, 1, 3], shN [N, K, 3];
 //! FreeTimeGsVanilla adds times, durations and velocities (`freetime`). splatfacto: `pipeline` with
@@ -7,6 +8,7 @@
 
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::freetime::{self, Moves};
+use super::rotors;
 use super::torch::{Tensor, Torch, Value, is_torch};
 use super::warnings::Warnings;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -23,6 +25,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read,
     writer: Writer::None("Write .ply, which gsplat and others load."),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Up in the world of nerfstudio.
@@ -33,8 +37,18 @@ const SPLATFACTO: &str = "_model.gauss_params.";
 const NAMED: usize = 8;
 
 fn read(bytes: &[u8]) -> Result<Opened> {
+    read_on(bytes, None)
+}
+
+/// Reads a checkpoint; of 4d-gaussian-splatting, whose clock has no seconds, with these as the first and last one.
+///
+/// Errors: damaged, no Gaussians that are read. [`Dialect::finish`] must follow.
+pub(super) fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
     let torch = Torch::open(bytes)?;
     let root = torch.root();
+    if let Some(opened) = rotors::read(&torch, clip)? {
+        return Ok(opened);
+    }
     let mut warnings = Warnings::default();
     if let Some(pipeline) =
         torch.get(root, "pipeline").filter(|p| torch.get(p, &format!("{SPLATFACTO}means")).is_some())
@@ -49,7 +63,8 @@ fn read(bytes: &[u8]) -> Result<Opened> {
         let keys: Vec<&str> = torch.keys(root).into_iter().take(NAMED).collect();
         let what = format!("this checkpoint of PyTorch holds no Gaussians that are read; it has {}", keys.join(", "));
         return Err(Error::new(ErrorKind::Unsupported, what).remedy(
-            "Checkpoints of gsplat, splatfacto and FreeTimeGsVanilla are read. Export .ply from other programs.",
+            "Checkpoints of gsplat, splatfacto, FreeTimeGsVanilla, 3DGS and 4d-gaussian-splatting are read. \
+             Give the folder of 4DGaussians, Deformable-3D-Gaussians and SC-GS. Export .ply from other programs.",
         ));
     };
     let file = Tensors { torch: &torch, dict: splats, prefix: "" };

@@ -4,10 +4,11 @@
 use super::DIALECTS;
 use super::mend::{self, Mended};
 use super::warnings::Warnings;
-use crate::layers::{Layer, Scene, moment};
+use crate::layers::{Layer, Scene, mirror, moment};
 use crate::motion::Still;
+use crate::scene::params::LOG_SCALE;
 use crate::scene::time::DEFAULT_FPS;
-use crate::scene::{Camera, LifeKind, Params, Time};
+use crate::scene::{Camera, GEOMETRY, LifeKind, Params, Time};
 use crate::{Error, ErrorKind, Result};
 use std::fmt;
 use std::io::Write;
@@ -41,6 +42,10 @@ pub struct Dialect {
     pub writer: Writer,
     /// Whether it can be written with positions of the world, in double precision ([`WriteOptions::world`]).
     pub world: bool,
+    /// Whether the specification states which way is up.
+    pub fixed_axes: bool,
+    /// Whether files or the specification state it: programs rotate them, and mirror them where they are left-handed.
+    pub(crate) states_up: bool,
 }
 
 /// How a dialect is written. Writers report what was left out.
@@ -69,11 +74,24 @@ pub struct WriteOptions {
     pub offset: [f64; 3],
     /// Write positions of the world: the offset is added, in double precision. Only .ply can.
     pub world: bool,
+    /// Units of the file in one of the scene, where files do not state which way is up.
+    pub units: f64,
+    /// Axis along which such files are mirrored, for left-handed programs.
+    pub mirrored: Option<usize>,
 }
 
 impl Default for WriteOptions {
     fn default() -> Self {
-        Self { spz_version: SPZ_VERSION, cameras: Vec::new(), exact: false, up: Y_DOWN, offset: [0.0; 3], world: false }
+        Self {
+            spz_version: SPZ_VERSION,
+            cameras: Vec::new(),
+            exact: false,
+            up: Y_DOWN,
+            offset: [0.0; 3],
+            world: false,
+            units: 1.0,
+            mirrored: None,
+        }
     }
 }
 
@@ -161,9 +179,9 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// The part of [`open`](Self::open) after reading: sets the up direction and repairs values at the edge. For files
-    /// that are read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
-    pub fn finish(&self, mut opened: Opened) -> Opened {
+    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files that are
+    /// read with others next to them.
+    pub(crate) fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);
         let (of, mut mended) = (opened.scene.len(), opened.ply.as_ref().map(|p| p.mended).unwrap_or_default());
         for layer in &mut opened.scene.layers {
@@ -180,7 +198,7 @@ impl Dialect {
     }
 
     /// Errors where it cannot be written.
-    pub fn check_written(&self) -> Result<()> {
+    fn check_written(&self) -> Result<()> {
         let Writer::None(remedy) = self.writer else { return Ok(()) };
         Err(Error::new(ErrorKind::Unsupported, format!("{} is read, but not written", self.name)).remedy(remedy))
     }
@@ -200,13 +218,34 @@ impl Dialect {
         }
         match self.writer {
             Writer::Moment(write) => {
-                let params = moment(scene, Time(scene.clip[0]))?;
+                let mut params = moment(scene, Time(scene.clip[0]))?;
                 params.check_finite()?;
+                if !self.states_up {
+                    fit(&mut params, &options);
+                }
                 write(&params, &options, out)
+            }
+            Writer::Moving(_) if !self.states_up && (options.units != 1.0 || options.mirrored.is_some()) => {
+                let what = format!("{} can be written neither mirrored nor in another unit", self.name);
+                Err(Error::new(ErrorKind::Unsupported, what).remedy("Write .usdz, or numbered files (--frames)."))
             }
             Writer::Moving(write) => write(scene, &options, out),
             Writer::None(_) => self.check_written().map(|()| Warnings::default()),
         }
+    }
+}
+
+/// Gives static Gaussians the unit and handedness of a program.
+fn fit(params: &mut Params, options: &WriteOptions) {
+    let (units, log) = (options.units as f32, options.units.ln() as f32);
+    let table = &mut params[GEOMETRY];
+    for row in (0..table.rows()).filter(|_| options.units != 1.0) {
+        let mean = table.read::<3>(row, 0);
+        table.write(row, 0, mean.map(|x| x * units));
+        table.add(row, LOG_SCALE, [log; 3]);
+    }
+    if let Some(axis) = options.mirrored {
+        mirror(params, axis);
     }
 }
 
@@ -240,9 +279,8 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{checkpoint, dynamic3d, ply, splat, splatv, spz, usd};
-    use crate::scene::params::LOG_SCALE;
-    use crate::scene::{GEOMETRY, SH};
+    use crate::format::{checkpoint, dynamic3d, ksplat, ply, splat, splats4d, splatv, spz, usd};
+    use crate::scene::SH;
 
     /// A scene that every dialect can hold.
     fn sample(moves: bool) -> Scene<f32> {
@@ -255,6 +293,8 @@ mod tests {
         let by_hand = [
             (dynamic3d::DIALECT, dynamic3d::tests::sample(), 2),
             (checkpoint::DIALECT, checkpoint::tests::sample(&gaussians(20, 4)), 20),
+            (splats4d::DIALECT, splats4d::tests::sample(), 21),
+            (ksplat::DIALECT, ksplat::tests::sample(&gaussians(20, 4), 1, 1), 20),
         ];
         for dialect in DIALECTS {
             let (scene, mut bytes, mut count) = (sample(dialect.moves), Vec::new(), 20);

@@ -28,6 +28,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::None("Write .stg.ply, .ftgs.ply or .usdz."),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// The file's usual name.

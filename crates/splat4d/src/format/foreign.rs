@@ -13,18 +13,7 @@ struct Foreign {
 }
 
 /// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
-const FOREIGN: [Foreign; 15] = [
-    Foreign {
-        is: |b| b.starts_with(b"SP4D"),
-        what: "a .splat4d of the program splats4D, another format under a similar name",
-        remedy: "Decode its frames with that program (`splat4d decode FILE --frame N -o N.splat`, where `splat4d` is the \
-                 command of the Python package splats4d) and open the numbered .splat files.",
-    },
-    Foreign {
-        is: |b| b.starts_with(b"\x894DGS"),
-        what: "a .4dgs of the fourdgs libraries",
-        remedy: "Convert it to numbered .ply files with those libraries.",
-    },
+const FOREIGN: [Foreign; 13] = [
     Foreign { is: <[u8]>::is_empty, what: "an empty file", remedy: "Copy or write it again." },
     Foreign {
         // A safetensors file whose header is 640 to 1,408 bytes long begins alike.
@@ -101,13 +90,12 @@ const PACKED: [&[u8]; 5] = [b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x
 const MESH: &str = "A mesh holds no Gaussians. Its points can start a training: give them to a capture as .ply.";
 
 /// Endings of formats without a mark.
-const ENDINGS: [(&str, &str, &str); 8] = [
+const ENDINGS: [(&str, &str, &str); 7] = [
     (".obj", "a mesh, not Gaussians", MESH),
     (".stl", "a mesh, not Gaussians", MESH),
     (".psht", "a project of Postshot", "Export it there as .ply."),
     (".lcc", "a scene of XGRIDS' LCC", "Export it as .ply with its program, or convert it with splat-transform."),
     (".rad", "a .rad of Spark", "Give the .ply or .spz that it was made of."),
-    (".ksplat", "a .ksplat of GaussianSplats3D", "Convert it to .ply first, for instance with splat-transform."),
     (
         ".splat4d",
         "a .splat4d of another program: those of splat4d begin with S4D",
@@ -150,11 +138,7 @@ mod tests {
     #[test]
     fn files_of_other_programs_are_named() {
         for (bytes, name, says) in [
-            (&b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}"[..], "a.splat4d", "splats4D"),
-            (b"SP4D", "a.s4d", "splats4D"),
-            (b"\x894DGS1\r\n", "a.4dgs", "fourdgs"),
-            (b"\0\x01\0\0", "A.KSPLAT", "GaussianSplats3D"),
-            (b"SPLAT4D\0", "a.splat4d", "another program"),
+            (&b"SPLAT4D\0"[..], "a.splat4d", "another program"),
             (b"\0\0\0\0", "a.4DGS", "another program"),
             (b"\x80\x02}q\0.", "a.pth", "pickle"),
             (b"", "a.s4d", "empty"),

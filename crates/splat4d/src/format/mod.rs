@@ -11,10 +11,13 @@ pub mod dialect;
 pub mod dynamic3d;
 mod fade;
 pub mod foreign;
+mod fourdgs;
 mod freetime;
 pub mod gltf;
 mod half;
+mod inflate;
 mod kinematic;
+mod ksplat;
 pub mod linear;
 pub mod mend;
 #[cfg(test)]
@@ -23,6 +26,8 @@ pub mod npy;
 pub mod playback;
 pub mod ply;
 pub mod quant;
+pub mod research;
+mod rotors;
 pub mod safetensors;
 #[cfg(test)]
 mod samples;
@@ -30,6 +35,7 @@ pub mod scene;
 pub mod sequence;
 pub mod sog;
 pub mod splat;
+mod splats4d;
 pub mod splatv;
 pub mod spz;
 mod torch;
@@ -49,6 +55,7 @@ use crate::{Error, Result};
 /// The files of Gaussians that other programs share. A dialect's properties are in its own file; nothing else lists
 /// them. Where two recognise a file by its bytes, the later one counts: a layout inside another one is listed after it.
 pub const DIALECTS: &[Dialect] = &[
+    ksplat::DIALECT,
     ply::DIALECT,
     ply::COMPRESSED,
     ply::STG,
@@ -62,6 +69,8 @@ pub const DIALECTS: &[Dialect] = &[
     gltf::COMPRESSED,
     usd::TEXT,
     usd::ARCHIVE,
+    fourdgs::DIALECT,
+    splats4d::DIALECT,
     dynamic3d::DIALECT,
     checkpoint::DIALECT,
 ];

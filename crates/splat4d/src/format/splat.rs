@@ -22,6 +22,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moment(|params, _, mut out| write(params, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Bytes per Gaussian.

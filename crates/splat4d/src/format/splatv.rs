@@ -29,6 +29,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write(scene, options, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// First four bytes.

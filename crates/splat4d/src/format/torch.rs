@@ -170,6 +170,12 @@ impl<'a> Torch<'a> {
         entries.iter().filter_map(text).collect()
     }
 
+    /// The items of a list or tuple; none of anything else.
+    pub(super) fn items<'b>(&'b self, list: &'b Value) -> Vec<&'b Value> {
+        let Value::List(items) = list else { return Vec::new() };
+        items.iter().map(|id| &self.objects[*id]).collect()
+    }
+
     /// The numbers of a tensor, row-major. Errors: it is outside its storage, which is missing or too short.
     pub(super) fn numbers(&self, tensor: &Tensor) -> Result<Vec<f32>> {
         let name = format!("{}data/{}", self.folder, tensor.key);

@@ -9,6 +9,7 @@ mod evaluation;
 mod finite;
 mod frame;
 mod freeze;
+mod mirror;
 mod rotate;
 #[cfg(test)]
 mod tests;
@@ -20,6 +21,7 @@ pub use convert::{to_native4d, to_spacetime};
 pub use evaluation::Evaluation;
 pub(crate) use evaluation::sweep;
 pub use freeze::{Gaussians, freeze, freeze_rows, moment};
+pub(crate) use mirror::mirror;
 pub use rotate::rotation_between;
 
 use crate::math::{Real, Rng, Sim3};

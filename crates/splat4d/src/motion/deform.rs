@@ -24,6 +24,7 @@ use crate::nn::{HashGrid, HashShape, InputGrad, LayerOutputs, Mlp, MlpShape, Pas
 use crate::scene::{GEOMETRY, Grads, Key, Params, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
+pub(crate) use rows::GAINS;
 use rows::{Bounds, Gather, Gradient, Spread, Written};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

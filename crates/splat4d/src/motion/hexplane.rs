@@ -138,7 +138,7 @@ impl HexplaneSpec {
     }
 
     /// Displacement of a position for a head's output 1, scene units: half the longest side of the box.
-    fn reach(&self) -> f64 {
+    pub(crate) fn reach(&self) -> f64 {
         (0..3).map(|k| 0.5 * (self.high[k] - self.low[k])).fold(0.0, f64::max)
     }
 }

@@ -19,6 +19,7 @@ pub mod spacetime;
 pub mod ssm;
 pub mod still;
 pub mod tracked;
+pub mod warp;
 
 use crate::math::{Real, Rng, Sim3};
 use crate::scene::params::LOG_SCALE;
@@ -136,6 +137,10 @@ registry! {
         Filtered(s: filtered::FilteredSpec) = "filtered" => s;
         /// A change on top of any of them.
         Edited(s: edited::EditedSpec) = "edited" => s;
+    }
+    foreign {
+        /// Gaussians that follow nodes by residuals (SC-GS).
+        Warp(s: warp::WarpSpec) = "warp" => s;
     }
 }
 

@@ -135,12 +135,13 @@ impl Polynomial {
 
 /// Generates `Spec`, the names and all functions of specs from the list of models.
 ///
-/// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
+/// `models` train by themselves, `wrappers` around another one, `foreign` ones are read from other programs' files. An entry names the variant, what binds its payload and
 /// the payload's type, the model's name, and a reference to what implements `Model`.
 macro_rules! registry {
     (
         models { $($(#[$doc:meta])* $variant:ident $(($bound:ident: $spec:ty))? = $name:literal => $model:expr;)* }
         wrappers { $($(#[$w_doc:meta])* $w_variant:ident($w_bound:ident: $w_spec:ty) = $w_name:literal => $wrapper:expr;)* }
+        foreign { $($(#[$f_doc:meta])* $f_variant:ident($f_bound:ident: $f_spec:ty) = $f_name:literal => $foreign:expr;)* }
     ) => {
         /// A model as plain data: what files store, and all that [`build`] needs to make it again.
         ///
@@ -151,6 +152,7 @@ macro_rules! registry {
         pub enum Spec {
             $($(#[$doc])* #[serde(rename = $name)] $variant $(($spec))?,)*
             $($(#[$w_doc])* #[serde(rename = $w_name)] $w_variant($w_spec),)*
+            $($(#[$f_doc])* #[serde(rename = $f_name)] $f_variant($f_spec),)*
             /// A model from outside this library; it can be built from a file where it is
             /// [registered](register).
             #[serde(skip)]
@@ -160,8 +162,8 @@ macro_rules! registry {
         /// Names of the models that train by themselves.
         pub const MODELS: &[&str] = &[$($name),*];
 
-        /// Names of all models that the library can build, with those that wrap another.
-        pub const BUILT_IN: &[&str] = &[$($name,)* $($w_name),*];
+        /// Names of all models that the library can build, with those that wrap another or are only read.
+        pub const BUILT_IN: &[&str] = &[$($name,)* $($w_name,)* $($f_name),*];
 
         impl Spec {
             /// The name that `--motion` takes and files store.
@@ -169,6 +171,7 @@ macro_rules! registry {
                 match self {
                     $(Spec::$variant $(($bound))? => { $(let _ = $bound;)? $name })*
                     $(Spec::$w_variant(_) => $w_name,)*
+                    $(Spec::$f_variant(_) => $f_name,)*
                     Spec::Custom(name) => name,
                 }
             }
@@ -192,6 +195,7 @@ macro_rules! registry {
                 match self {
                     $(Spec::$variant $(($bound))? => Some(Model::capabilities($model)),)*
                     $(Spec::$w_variant($w_bound) => Some(Model::capabilities($wrapper)),)*
+                    $(Spec::$f_variant($f_bound) => Some(Model::capabilities($foreign)),)*
                     Spec::Custom(_) => None,
                 }
             }
@@ -211,6 +215,7 @@ macro_rules! registry {
             match spec {
                 $(Spec::$variant $(($bound))? => Model::build($model, p),)*
                 $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*
+                $(Spec::$f_variant($f_bound) => Model::build($foreign, p),)*
                 Spec::Custom(name) => outside::build(name, p).unwrap_or_else(|| {
                     Err(Error::input(format!("motion model `{name}` is not one of this version's"))
                         .remedy(format!("Known are: {}. A newer splat4d may have more", BUILT_IN.join(", "))))

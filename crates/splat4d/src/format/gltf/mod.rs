@@ -12,9 +12,10 @@ mod read;
 pub(super) mod tests;
 mod write;
 
-use super::dialect::{Dialect, Writer, Y_UP};
-use crate::{Error, ErrorKind};
-pub use read::{buffers_of, read_text};
+use super::dialect::{Dialect, Opened, Writer, Y_UP};
+use crate::{Error, ErrorKind, Result};
+pub use read::buffers_of;
+use std::collections::BTreeMap;
 
 /// glTF with Gaussians, one file.
 pub const DIALECT: Dialect = Dialect {
@@ -28,6 +29,8 @@ pub const DIALECT: Dialect = Dialect {
         write::plain(params).and_then(|(file, warnings)| file.write_binary(&mut out).map(|()| warnings))
     }),
     world: false,
+    fixed_axes: true,
+    states_up: true,
 };
 
 /// The same as JSON.
@@ -35,7 +38,7 @@ pub const TEXT: Dialect = Dialect {
     name: "glTF as JSON (KHR_gaussian_splatting)",
     ending: ".gltf",
     mark: Some(container::is_text),
-    read: |bytes| read_text(bytes, &Default::default()),
+    read: |bytes| read::text(bytes, &Default::default()),
     writer: Writer::Moment(|params, _, mut out| {
         write::plain(params).and_then(|(file, warnings)| file.write_text(&mut out).map(|()| warnings))
     }),
@@ -52,6 +55,11 @@ pub const COMPRESSED: Dialect = Dialect {
     }),
     ..DIALECT
 };
+
+/// Reads a .gltf with the files that [`buffers_of`] names. Errors: damaged, a file is missing, no Gaussians.
+pub fn read_text(text: &[u8], files: &BTreeMap<String, Vec<u8>>) -> Result<Opened> {
+    read::text(text, files).map(|opened| TEXT.finish(opened))
+}
 
 /// First bytes of a .glb.
 const MAGIC: [u8; 4] = *b"glTF";

@@ -21,8 +21,8 @@ const UNIFORM: f64 = 1e-4;
 /// often, but 1 MB must not become 100 GB.
 const ALWAYS: usize = 1 << 16;
 
-/// Reads a .gltf with the files that [`buffers_of`] names. Errors: damaged, a file is missing, no Gaussians.
-pub fn read_text(text: &[u8], files: &BTreeMap<String, Vec<u8>>) -> Result<Opened> {
+/// Reads a .gltf with its files.
+pub(super) fn text(text: &[u8], files: &BTreeMap<String, Vec<u8>>) -> Result<Opened> {
     read(&File::text(text, files)?)
 }
 

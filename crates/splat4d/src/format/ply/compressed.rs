@@ -26,6 +26,8 @@ pub const COMPRESSED: Dialect = Dialect {
     read: open,
     writer: Writer::Moment(|params, _, mut out| write_compressed(params, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Whether the element holds packed Gaussians.

@@ -30,6 +30,8 @@ pub(crate) const FTGS: Dialect = Dialect {
     read: read_ftgs,
     writer: Writer::Moving(|scene, options, mut out| write_ftgs(scene, options, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Properties in addition to those of a plain file.

@@ -11,6 +11,7 @@ mod compressed;
 mod filter;
 mod ftgs;
 mod header;
+mod numbered;
 mod pack;
 mod rows;
 mod stg;
@@ -33,6 +34,7 @@ use std::io::Write;
 
 pub use compressed::COMPRESSED;
 pub(crate) use ftgs::FTGS;
+pub(in crate::format) use numbered::numbered;
 pub(crate) use pack::write_compressed;
 pub use stg::{STG, write_stg};
 
@@ -49,6 +51,8 @@ pub const DIALECT: Dialect = Dialect {
         write_placed(params, offset, &mut out).map(|()| Warnings::default())
     }),
     world: true,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// f_rest properties of SH degree 0, 1, 2 and 3: three channels of the coefficients above the first.

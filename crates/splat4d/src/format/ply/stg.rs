@@ -27,6 +27,8 @@ pub const STG: Dialect = Dialect {
     read: |bytes| read_stg(bytes).map(Opened::from),
     writer: Writer::Moving(|scene, options, mut out| write_stg(scene, options, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// Numbers of a row as [`names`] lists them.

@@ -36,6 +36,8 @@ pub const DIALECT: Dialect = Dialect {
     read: |bytes| read(&unzip(bytes)?).map(Opened::from),
     writer: Writer::Moment(|params, _, out| write::write(params, out)),
     world: false,
+    fixed_axes: false,
+    states_up: false,
 };
 
 /// The version this library reads.

@@ -8,8 +8,8 @@
 use crate::format::bytes::Cursor;
 use crate::format::dialect::Y_DOWN;
 use crate::format::warnings::Warnings;
-use crate::scene::params::QUAT;
-use crate::scene::{GEOMETRY, Params, SH};
+use crate::layers::mirror;
+use crate::scene::Params;
 
 /// Extension that names the axes of the numbers (Adobe): one u32, the number of a coordinate system.
 const EXTENSION: u32 = 0xADBE_0003;
@@ -19,8 +19,6 @@ const SYSTEMS: [&str; 17] = [
 ];
 /// Cosine from which a direction counts as an axis.
 const ALONG: f64 = 1.0 - 1e-6;
-/// Coefficients of spherical harmonics that change sign with x: those with an odd power of it.
-const ODD_IN_X: [usize; 6] = [3, 4, 7, 10, 13, 15];
 
 /// Beginning of the remark that a file does not name its axes.
 pub(crate) const ASSUMED: &str = "the file does not name its axes";
@@ -108,23 +106,9 @@ pub(super) fn settle(axes: Option<Axes>, params: &mut Params, warnings: &mut War
     };
     if axes.is_mirrored() {
         warnings.add(format!("the file's axes are left-handed ({}): x is mirrored", axes.name()));
-        mirror_x(params);
+        mirror(params, 0);
     }
     axes.up()
-}
-
-/// Mirrors a world along x: means, rotations and spherical harmonics.
-fn mirror_x(params: &mut Params) {
-    let [geometry, sh] = params.get_mut([GEOMETRY, SH]);
-    for row in 0..geometry.rows() {
-        geometry.set(row, 0, -geometry.get(row, 0));
-        let [w, x, y, z] = geometry.read::<4>(row, QUAT);
-        geometry.write(row, QUAT, [w, x, -y, -z]);
-        let width = sh.width();
-        for k in ODD_IN_X.into_iter().filter(|k| 3 * k < width) {
-            (3 * k..3 * k + 3).for_each(|c| sh.set(row, c, -sh.get(row, c)));
-        }
-    }
 }
 
 #[cfg(test)]
@@ -132,6 +116,8 @@ mod tests {
     use super::*;
     use crate::format::samples::gaussians;
     use crate::math::{quat, sh};
+    use crate::scene::params::QUAT;
+    use crate::scene::{GEOMETRY, SH};
 
     #[test]
     fn every_up_along_an_axis_has_a_right_handed_system() {

@@ -4,12 +4,12 @@ use super::axes::{self, Axes};
 use super::streams::{STREAMS, Streams, lengths};
 use super::{EXTENDED, GZIP_MAGIC, Header, MAGIC, damaged};
 use crate::format::bytes::Cursor;
+use crate::format::inflate::zstd;
 use crate::format::warnings::Warnings;
 use crate::{Error, Result};
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
-use ruzstd::decoding::StreamingDecoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use std::borrow::Cow;
 use std::io::{Read, Write};
@@ -27,11 +27,7 @@ const PER_BYTE: usize = 1;
 const ALWAYS: usize = 1 << 16;
 /// Bytes of extensions behind the streams that are inflated to get to the checksum.
 const MOST_TAIL: u64 = 1 << 20;
-/// Largest zstd window that is granted, bytes: the one that RFC 8878 (3.1.1.1.2) requires of every decoder. A larger
-/// one is granted up to the plain length.
-const WINDOW: u64 = 8 << 20;
-
-/// Content of a file.
+/// What a file holds.
 pub(super) struct Opened<'a> {
     pub(super) header: Header,
     pub(super) streams: Streams<'a>,
@@ -156,25 +152,12 @@ fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<Opened<'a
             return Err(damaged(format!("expected a stream of {length} bytes, but its entry states {plain}")));
         }
         let packed = usize::try_from(packed).map_err(|_| damaged("a stream is longer than the file"))?;
-        *stream = Cow::Owned(inflate(data.take(packed)?, length)?);
+        *stream = Cow::Owned(zstd(data.take(packed)?, length).map_err(damaged)?);
     }
     Ok(Opened { header, streams, axes })
 }
 
-/// A zstd frame of exactly `length` plain bytes.
-fn inflate(packed: &[u8], length: usize) -> Result<Vec<u8>> {
-    let broken = |e: &dyn std::fmt::Display| damaged(format!("a zstd stream cannot be read ({e})"));
-    let window = WINDOW.max(length as u64);
-    let unzip = StreamingDecoder::new_with_max_window_size(packed, window).map_err(|e| broken(&e))?;
-    let mut plain = Vec::new();
-    unzip.take(length as u64 + 1).read_to_end(&mut plain).map_err(|e| broken(&e))?;
-    if plain.len() != length {
-        return Err(damaged(format!("a stream of {length} bytes has {} or more", plain.len())));
-    }
-    Ok(plain)
-}
-
-/// The whole file. `extensions`: their records, if the header's flags announce any.
+/// The whole file. `extensions`: their records, where the header's flags say that there are any.
 pub(super) fn close(header: &Header, streams: &Streams<'_>, extensions: &[u8]) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     out.extend(header.version.to_le_bytes());

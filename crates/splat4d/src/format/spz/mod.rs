@@ -37,6 +37,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
     },
     writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, options.up, &mut out)),
     world: false,
+    fixed_axes: false,
+    states_up: true,
 };
 
 /// The versions this library reads and writes.

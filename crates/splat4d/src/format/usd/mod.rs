@@ -32,6 +32,8 @@ pub(crate) const TEXT: Dialect = Dialect {
     read: |bytes| scene::opened(&stage::Stage::read(bytes)?),
     writer: Writer::Moving(write::write),
     world: false,
+    fixed_axes: false,
+    states_up: true,
 };
 
 /// An archive with one such layer.
