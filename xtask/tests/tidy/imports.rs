@@ -110,6 +110,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "baking",
             "playable",
             "growing",
+            "programs",
             "converting",
             "exporting",
             "localising",

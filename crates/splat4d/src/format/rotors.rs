@@ -155,6 +155,3 @@ impl Tuple<'_> {
         Ok(params)
     }
 }
-
-#[cfg(test)]
-mod tests;
