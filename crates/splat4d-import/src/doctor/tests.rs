@@ -268,7 +268,7 @@ fn a_wrong_focal_length_and_swapped_cameras_are_found() {
     write(folder.path(), clean(), 0.0, CAMERAS);
     let path = folder.path().join("capture.json");
     let sound: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
-    let says = |json: &serde_json::Value| {
+    let examined = |json: &serde_json::Value| {
         std::fs::write(&path, json.to_string()).unwrap();
         let capture = Capture::open(folder.path(), &CaptureOptions::default()).unwrap();
         let options = Options { features: 500, ..Options::default() };
@@ -278,11 +278,11 @@ fn a_wrong_focal_length_and_swapped_cameras_are_found() {
     for f in ["fx", "fy"] {
         longer["cameras"][ILL][f] = json!(1.06 * sound["cameras"][ILL][f].as_f64().unwrap());
     }
-    assert_eq!(found(&report_of(&longer), "epipolar"), ["c3"]);
+    assert_eq!(found(&examined(&longer), "epipolar"), ["c3"]);
     let mut swapped = sound.clone();
     swapped["cameras"][0]["images"] = sound["cameras"][4]["images"].clone();
     swapped["cameras"][4]["images"] = sound["cameras"][0]["images"].clone();
-    let report = report_of(&swapped);
+    let report = examined(&swapped);
     let ill = found(&report, "epipolar");
     assert!(["c0", "c4"].iter().all(|c| ill.iter().any(|i| i == c)), "{:#?}", report.findings);
 }
