@@ -15,7 +15,7 @@
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
 
-#![allow(missing_docs)] // nobody outside the workspace reads it
+#![allow(missing_docs)] // internal to the workspace
 
 pub mod console;
 mod device;

@@ -4,7 +4,7 @@
 //! [`READERS`] is the one list: `cargo run --release -p xtask -- fuzz` mutates seeds of each on a stable toolchain, and
 //! `fuzz/` holds a `cargo fuzz` target of each.
 
-#![allow(missing_docs)] // nobody outside the workspace reads it
+#![allow(missing_docs)] // internal to the workspace
 
 mod captures;
 mod formats;

@@ -211,8 +211,8 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {
         return with(Body::empty(), StatusCode::NOT_MODIFIED, &common);
     }
-    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No
-    // date is ever given out, so that a date matches nothing.
+    // A range counts for GET only (RFC 9110), and only of the version that the client states, if any. No date is ever
+    // given out, so that a date matches nothing.
     let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
     let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
     match range.and_then(|r| r.to_str().ok()).map_or(Requested::Whole, |r| range::parse(r, version.length)) {

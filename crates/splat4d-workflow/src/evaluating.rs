@@ -175,7 +175,7 @@ impl Times {
             orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
         Ok(Self {
             scores: step * HELD_STEPS * held as f64,
-            // That of a long capture is made by then.
+            // That of a long capture already exists.
             playback: if Chunked::is(&run.path) { 0.0 } else { step * BAKE_STEPS },
             film: step * FILM_STEPS * frames,
         })

@@ -97,6 +97,6 @@ fn main() -> splat4d::Result<()> {
     let ms = start.elapsed().as_secs_f64() * 1e3;
     let squares: f64 = image.color.data.iter().zip(&expected.color.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     let db = -10.0 * (squares / image.color.data.len() as f64).log10();
-    println!("the CPU's first picture took {ms:.0} ms; the GPU's differs from it by {db:.1} dB");
+    println!("the CPU's first image took {ms:.0} ms; the GPU's differs from it by {db:.1} dB");
     Ok(())
 }

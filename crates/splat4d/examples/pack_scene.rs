@@ -265,7 +265,7 @@ fn compare(scene: &Scene<f32>, back: &Scene<f32>, draft: &Draft) {
         let psnr = -10.0 * error.log10();
         (worst, sum, count) = (f64::min(worst, psnr), sum + psnr, count + 1.0);
     }
-    println!("pictures against the floats: mean {:.2} dB, worst {worst:.2} dB", sum / count);
+    println!("images against the floats: mean {:.2} dB, worst {worst:.2} dB", sum / count);
 }
 
 /// The cameras of a cameras.json as 3DGS programs write it, each name once.

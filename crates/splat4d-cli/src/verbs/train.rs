@@ -230,7 +230,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
         // The model is chosen by the capture; the library's default is one model.
         None => Recipe::default().with(|r| r.run.motion = MotionName::AUTO),
         Some(path) => {
-            // An empty one, or one of the kernel that claims to be, would be the defaults without a word.
+            // An empty one, or one of the kernel that claims to be, would silently be the defaults.
             files::open(path)?;
             Recipe::from_toml(&files::read_text(path)?).map_err(|e| e.at(path.display()))?
         }

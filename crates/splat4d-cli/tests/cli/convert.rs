@@ -78,7 +78,7 @@ fn a_dynamic_scene_converts_to_every_format() {
         assert!(said.contains("one time") && said.contains("--frames"), "{name}: {said}");
         assert_eq!(open(&at(name)).len(), 40);
     }
-    // z up became y down: what was z is now −y, at the time that was asked for.
+    // z up became y down: what was z is now −y, at the requested time.
     convert("birds.safetensors", "then.ply", &["--time", "0.75", "--sh", "0"]);
     let then = open(&at("then.ply"));
     let (own, was) = (&then.layers[0].params, moving());

@@ -80,7 +80,7 @@ impl FromStr for Board {
             None => None,
             Some("floor") => Some(Lies::Floor),
             Some("wall") => Some(Lies::Wall),
-            Some(other) => return wrong(format!("stands on \"{other:.40}\"")),
+            Some(other) => return wrong(format!("has an unknown orientation, \"{other:.40}\"")),
         };
         if parts.len() > 3 {
             return wrong("has too many parts".into());

@@ -91,7 +91,7 @@ fn camera(tree: &Tree, opengl: bool) -> Result<Part> {
     };
     let to_world = key == "camera_to_world";
     if opengl {
-        // y and z of the camera the other way round: columns of camera to world, rows of world to camera.
+        // y and z of the camera are negated: columns of camera to world, rows of world to camera.
         for axis in 1..3 {
             if to_world {
                 (0..3).for_each(|i| pose.rotation[i][axis] *= -1.0);

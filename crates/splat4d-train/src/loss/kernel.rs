@@ -278,7 +278,7 @@ impl<'a, F: Real> Tile<'a, F> {
         let taps = &self.job.taps;
         let (c1, c2) = (F::of(C1), F::of(C2));
         let [start, end] = self.derivatives;
-        // Arrays and a length that the compiler knows to be within them: no bound is checked in the loop.
+        // Arrays and a length that the compiler can prove to be within them: no bound is checked in the loop.
         let n = (end - start).min(READ - TAPS + 1);
         let [x, y, squares, cross] = means.each_ref().map(|row| read(row, start + SHIFT));
         let [da, db, dc] = out.each_mut().map(|row| write(row, start));

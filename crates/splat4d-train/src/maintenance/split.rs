@@ -140,7 +140,7 @@ mod tests {
             let g = &mut params[GEOMETRY];
             g.write(row, 0, [row as f32, 0.5, 0.0, 1.0]);
             g.write(row, 7, [-2.0, -2.5, -1.5, 0.3]);
-            // A third moves, a third comes and goes, a third stands.
+            // A third moves, a third appears and disappears, a third is static.
             params[velocities].write(row, 0, [if row % 3 == 0 { 0.5 } else { 0.001 }, 0.0, 0.0]);
             params[LIFE].write(row, 0, [0.5, if row % 3 == 1 { -2.0 } else { 2.0 }]);
             params[SH].write(row, 0, [row as f32, 1.0, 2.0]);

@@ -228,7 +228,7 @@ fn sides(out: &mut String, told: &Compressed) {
     let _ = write!(
         out,
         "</table></div>\n<p class=\"note\">The last column compares with {against}. Frames per second: this \
-         machine's CPU, same size and cameras, columns measured in turns. End to end includes the active set, \
+         machine's CPU, same size and cameras, columns measured alternately. End to end includes the active set, \
          motion, rendering and conversion to 8-bit colours.</p>\n"
     );
 }

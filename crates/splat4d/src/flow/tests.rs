@@ -10,8 +10,8 @@ use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
 
 /// Flow of an exactly known field, pixels: only rounding is left.
 const EXACT: f64 = 1e-9;
-/// Flow where the field is not constant under a splat, pixels: the camera comes 8 % nearer, so that the field changes by
-/// .08 px a pixel, and the centre of the splat that a pixel shows may be a pixel aside.
+/// Flow where the field is not constant under a splat, pixels: the camera comes 8 % nearer, so that the field changes
+/// by .08 px a pixel, and the centre of the splat that a pixel shows may be a pixel aside.
 const UNDER_A_SPLAT: f64 = 0.08;
 /// Edge of the test images, pixels.
 const SIZE: usize = 40;
@@ -117,7 +117,7 @@ fn a_translating_wall_has_constant_flow_and_velocity() {
         each_pixel(&forward, |x, y, f| {
             assert!((f[0] - truth[0]).abs() < EXACT && (f[1] - truth[1]).abs() < EXACT, "{x} {y}: {f:?} {truth:?}");
         });
-        // There and back again ends where it began.
+        // A path forwards and back ends at its start.
         let backward = render_flow(&scene, shot(to), shot(from), &mut renderer());
         each_pixel(&backward, |_, _, b| {
             assert!((b[0] + truth[0]).abs() < EXACT && (b[1] + truth[1]).abs() < EXACT);

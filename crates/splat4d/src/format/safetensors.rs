@@ -395,7 +395,7 @@ impl<'de> Deserialize<'de> for Header {
                 let mut names = BTreeSet::new();
                 while let Some(name) = map.next_key::<String>()? {
                     if !names.insert(name.clone()) {
-                        return Err(serde::de::Error::custom(format_args!("`{name}` stands twice")));
+                        return Err(serde::de::Error::custom(format_args!("`{name}` is a duplicate")));
                     }
                     if name == METADATA {
                         header.metadata = map.next_value()?;

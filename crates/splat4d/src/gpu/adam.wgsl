@@ -3,8 +3,8 @@
 // Bindings, group 0: 0 rule; 1 counts ([3]: stopped); 2 params, 3 gradient: buffers of `stride` columns, of which the
 // table has some; 4 moments: a buffer of `moments_stride` columns, first and second moments and the row's step count; 5
 // alive: the rows that take part; 6 corrections by step count, made by the CPU; 7 status, a word a table: one more than
-// the last row whose number is not finite. Seven storage buffers.
-// A thread owns one row. A table with more columns than there is room for rates is taken in pieces, in order.
+// the last row whose number is not finite. Seven storage buffers. A thread owns one row. A table with more columns than
+// there is room for rates is taken in pieces, in order.
 
 const TABLE_BLOCK: u32 = 16u;
 const ROW_THREADS: u32 = 256u;

@@ -4,8 +4,8 @@
 //
 // Bindings, group 0: 0 view; 1 query; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the
 // SH table; in and out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7
-// stats, three columns per row: sum of |dL/dmean2d|, number of views that rendered it, largest radius; 8 weights of the blocks
-// of SH, which the gradients replace. Seven storage buffers. A thread owns one row.
+// stats, three columns per row: sum of |dL/dmean2d|, number of views that rendered it, largest radius; 8 weights of the
+// blocks of SH, which the gradients replace. Seven storage buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 const STATS_WIDTH: u32 = 3u;

@@ -1,8 +1,8 @@
 // Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and
 // its VJP), motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
 //
-// No bindings and no entry point, but for `params`, which the including shader binds: all tables of a layer but the
-// SH, one after the other, [row / 16][column][16].
+// No bindings and no entry point, but for `params`, which the including shader binds: all tables of a layer but the SH,
+// one after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
 // Threads of a workgroup of the kernels over rows (gpu/tuning.rs).

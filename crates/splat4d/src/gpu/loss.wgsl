@@ -3,12 +3,12 @@
 //
 // Two dispatches, a workgroup a tile of 16 x 16 pixels: `moments` writes the derivatives of SSIM to the local moments,
 // and what the tile adds to the value; `gradient` blurs these derivatives and writes the gradient to the rendered
-// image. Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for
-// red, green, blue and weight, or three planes of f32, behind which is a plane of weights where pixels have some that
-// are not of 8 bits; 3 maps: nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials:
-// sixteen numbers per tile, |error|, SSIM and squared error with weights, one unused, the twelve of the camera's matrix
-// and offsets; 6 responses: those twelve, a camera after the other, without the identity. Six storage buffers, 14.5 KiB
-// of workgroup memory. A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
+// image. Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for red,
+// green, blue and weight, or three planes of f32, behind which is a plane of weights where pixels have some that are
+// not of 8 bits; 3 maps: nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials: sixteen
+// numbers per tile, |error|, SSIM and squared error with weights, one unused, the twelve of the camera's matrix and
+// offsets; 6 responses: those twelve, a camera after the other, without the identity. Six storage buffers, 14.5 KiB of
+// workgroup memory. A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
 
 const TILE: u32 = 16u;
 const THREADS: u32 = 256u;

@@ -1,5 +1,5 @@
-// The record of a step on resident tables: sums over the tiles of each view, the cameras' colour matrices, and
-// the record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
+// The record of a step on resident tables: sums over the tiles of each view, the cameras' colour matrices, and the
+// record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
 //
 // Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last. Bindings,
 // group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were requested

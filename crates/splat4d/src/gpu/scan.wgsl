@@ -1,6 +1,6 @@
 // Exclusive sums of u32, and what follows from their total: how many workgroups later dispatches need. Twin of the
-// running sums in render/bin.rs. Sums stop at 2^32 - 1 instead of wrapping: a reader of the total sees that it is
-// too many.
+// running sums in render/bin.rs. Sums stop at 2^32 - 1 instead of wrapping: a reader of the total sees that it is too
+// many.
 //
 // Three dispatches: block_sums (a workgroup a block of 2,048), total (one workgroup), offsets (as block_sums).
 // Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of

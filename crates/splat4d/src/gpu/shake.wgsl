@@ -1,8 +1,8 @@
 // Noise on the positions of the rows that are alive, after Adam. Twin of splat4d-train's optim/noise.rs, which
 // documents the equation; learnt.wgsl and numbers.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 query; 1 noise; 2 counts ([3]: stopped); 3 alive; in and out: 4 params. Three storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 query; 1 noise; 2 counts ([3]: stopped); 3 alive; in and out: 4 params. Three storage buffers. A
+// thread owns one row.
 
 struct Noise {
     strength: f32,

@@ -38,8 +38,7 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     // h w, zero where the exponent has stopped.
     let fade = select(0.0, d0.w * opacity * life, s.near);
     let d_tau = s.inverse * (dot(d_mean, s.v) - fade * s.tau);
-    // Where c is free, the terms of dL/dc join those of dL/dv: K replaces L, and -tau dtau/c is left along its
-    // row.
+    // Where c is free, the terms of dL/dc join those of dL/dv: K replaces L, and -tau dtau/c is left along its row.
     let free = s.c > query.floor;
     let side = s.inverse * (d_mean * s.tau - 2.0 * (m * s.v));
     let along = select(0.0, -s.tau * s.inverse * d_tau, free);

@@ -2,13 +2,12 @@
 // come nearest first, so that a stable sort of the pairs by tile leaves each tile's list in the order (depth, number).
 // render/project.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 band; 2 counts ([1]: visible splats, [2]: pairs); 3 order (splats, nearest first);
-// 4 shapes; 5 tile_counts (written by count), 6 first_pairs (their exclusive sums, read by emit); written by emit, one
-// a pair: 7 keys (tile within the band), 8 values (number of the pair), 9 owners (splat, and its quadrants of the
-// tile). Eight storage buffers.
-// count: a thread owns a splat. emit: a workgroup owns 256 splats, and its threads share out their pairs, so that a
-// splat over the whole image delays no thread for long. The two are compiled apart, and rounding may make them disagree
-// by a tile: a slot without a tile gets one past the last tile, which sorts it behind all lists.
+// Bindings, group 0: 0 view; 1 band; 2 counts ([1]: visible splats, [2]: pairs); 3 order (splats, nearest first); 4
+// shapes; 5 tile_counts (written by count), 6 first_pairs (their exclusive sums, read by emit); written by emit, one a
+// pair: 7 keys (tile within the band), 8 values (number of the pair), 9 owners (splat, and its quadrants of the tile).
+// Eight storage buffers. count: a thread owns a splat. emit: a workgroup owns 256 splats, and its threads share out
+// their pairs, so that a splat over the whole image delays no thread for long. The two are compiled apart, and rounding
+// may make them disagree by a tile: a slot without a tile gets one past the last tile, which sorts it behind all lists.
 
 const TILE: u32 = 16u;
 // Added under the root of a chord, so that rounding never loses a pixel that a tangent touches (render/rasterize.rs).

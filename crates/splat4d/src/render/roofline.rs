@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_loop_blends() {
-        // Every pixel stopped with T just above t_min: light 1 − T left it, and its T is negative by then.
+        // Every pixel stopped with T just above t_min: light 1 − T left it, and its T is then negative.
         let splat = Splat { color: [[1.0; 8], [0.0; 8], [0.0; 8]], ..Splat::default() };
         let sum = dispatch(Simd::Scalar, Pixels::<8, 2>(&splat));
         let expected = 16.0 * (1.0 - 2.0 * splat.t_min[0]);

@@ -26,7 +26,7 @@ pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 const CONTRAST: f64 = 0.004;
 /// Weight of a mask or alpha from which a pixel shows something.
 const SHOWN: f32 = 0.5;
-/// Foreground below this share of an image, or above the other, tells nothing about a position.
+/// Foreground below this share of an image, or above the other, gives no information on a position.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
 /// A feature: its descriptor, and its ray without distortion (x/z, y/z).

@@ -1,8 +1,8 @@
 //! Whether anything moves in front of moving cameras: matches of frames at different times either agree with one static
 //! scene, or are next to their epipolar lines.
 //!
-//! Wrong matches are spread over the image, moved features are near their lines. Matches near the lines in excess of the
-//! expected wrong ones count as moved.
+//! Wrong matches are spread over the image, moved features are near their lines. Matches near the lines in excess of
+//! the expected wrong ones count as moved.
 
 use super::super::{Capture, Timing};
 use super::look;
@@ -12,17 +12,17 @@ use splat4d::math::Se3;
 
 /// Frames that are compared with later ones, evenly chosen.
 const STARTS: usize = 12;
-/// Parts of the film between a frame and the two that it is compared with: the first shares most of its image, the second
-/// gives motion time.
+/// Parts of the film between a frame and the two that it is compared with: the first shares most of its image, the
+/// second gives motion time.
 const GAPS: [usize; 2] = [40, 12];
-/// Distances from the epipolar line, pixels of the small image: up to the first a match agrees, between the second and the
-/// third it is a feature that moved, between the third and the fourth it is a wrong match.
+/// Distances from the epipolar line, pixels of the small image: up to the first a match agrees, between the second and
+/// the third it is a feature that moved, between the third and the fourth it is a wrong match.
 const BANDS: [f64; 4] = [1.5, 3.0, 8.0, 40.0];
 /// Fewest matches that agree of a pair that counts, and of all pairs together.
 const FEWEST: [usize; 2] = [10, 200];
-/// Share of features that moved up to which a scene is static, where the capture states times, as those of moving scenes do,
-/// and where they are taken from the names of numbered images, as walks through a building have them. Measured: walks and
-/// rooms up to 0.7 %, a moving hand 1.9 % (studies/records/2026-11-26-real-size.md).
+/// Share of features that moved up to which a scene is static, where the capture states times, as those of moving
+/// scenes do, and where they are taken from the names of numbered images, as walks through a building have them.
+/// Measured: walks and rooms up to 0.7 %, a moving hand 1.9 % (studies/records/2026-11-26-real-size.md).
 const STATIC: [f64; 2] = [0.003, 0.0125];
 
 /// How far matches of frames at different times agree with one static scene.
@@ -92,7 +92,7 @@ fn counts(matches: &[Match], distance: impl Fn(&Match) -> f64) -> [f64; 2] {
     if agree < FEWEST[0] as f64 {
         return [0.0; 2];
     }
-    // Wrong matches are spread over the image: as many a pixel where features hardly move so far.
+    // Wrong matches are spread over the image: as many per pixel where features hardly move that far.
     let chance = within(far, end) * (far - beside) / (end - far);
     [agree, within(beside, far) - chance]
 }

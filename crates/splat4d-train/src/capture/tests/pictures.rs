@@ -106,7 +106,8 @@ fn fisheye_borders_are_marked() {
 
 #[test]
 fn undistortion_inverts_a_distorted_image() {
-    // An image whose colours are linear in its ray is distorted by the closed model and must come back linear.
+    // An image whose colours are linear in its ray is distorted by the closed model and must be linear again
+    // afterwards.
     let sample = samples::own();
     let lens = splat4d::scene::Lens::Brown { k: [-0.2, 0.03, 0.0, 0.0, 0.0, 0.0], p: [2e-3, -1e-3], s: [0.0; 4] };
     let distortion = Distortion::new(lens);

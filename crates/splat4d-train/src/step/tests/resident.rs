@@ -137,7 +137,7 @@ fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
     };
     let Some((whole, checkpoints)) = run() else { return };
     let [first, second] = &checkpoints[..] else { panic!("two checkpoints") };
-    // The same bits again, without reads in between: as many steps are under way as may be.
+    // The same bits again, without reads in between: as many steps as possible are in flight.
     let mut unseen = on_gpu(bed, recipe).expect("there was a GPU");
     let (mse, _) = finish(&mut unseen, "unseen");
     assert!(bytes(unseen.scene()) == whole, "it does not depend on who looks when");

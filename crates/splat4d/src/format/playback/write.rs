@@ -273,7 +273,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         let (first_a, first_b) = (holds(a), holds(b));
         let by_time = na.from.total_cmp(&nb.from).then(nb.to.total_cmp(&na.to)).then(a.node.cmp(&b.node));
         let by_tier = a.tier.cmp(&b.tier);
-        // At the start all nodes are needed at once, and a tier goes before a node; later it is the other way round.
+        // At the start all nodes are needed at once, and a tier goes before a node; later the order is reversed.
         first_b.cmp(&first_a).then(if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) })
     });
     let before = pieces.iter().take_while(|p| p.tier == 0 && holds(p)).count();

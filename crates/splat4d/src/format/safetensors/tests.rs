@@ -87,7 +87,7 @@ fn inconsistent_arrays_are_errors_that_name_the_array() {
                     "a":{"dtype":"U8","shape":[1],"data_offsets":[0,1]}}"#,
                 &[0],
             ),
-            "`a` stands twice",
+            "`a` is a duplicate",
         ),
         (
             file(
