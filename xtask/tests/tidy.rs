@@ -367,10 +367,7 @@ fn flags_in_documents_exist() {
 /// learnt.
 const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
 /// In addition to these, each with its reason.
-const MODEL_NAMES: [(&str, &str); 2] = [
-    ("crates/splat4d/src/format/rotors.rs", "makes the model of a checkpoint"),
-    ("crates/splat4d/src/layers/convert.rs", "turns one model into another"),
-];
+const MODEL_NAMES: [(&str, &str); 1] = [("crates/splat4d/src/layers/convert.rs", "turns one model into another")];
 
 /// Names and variants of the list of motion models: lines like `Still = "still" => ...`.
 fn models() -> Vec<(String, String)> {
@@ -426,10 +423,8 @@ fn motion_models_are_named_only_in_their_modules() {
 /// The list of file dialects, in whose folder each declares itself.
 const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 /// Files elsewhere that may name one of them, each with its reason.
-const DIALECT_NAMES: [(&str, &str); 2] = [
-    ("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder"),
-    ("crates/splat4d/src/format/research/mod.rs", "Gaussians whose network is a checkpoint"),
-];
+const DIALECT_NAMES: [(&str, &str); 1] =
+    [("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder")];
 
 /// A new dialect is its own file and its entry in the list: no other code may name one. Its properties state what
 /// others need.

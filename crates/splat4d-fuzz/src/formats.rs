@@ -45,6 +45,8 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "torch", seeds: torch_seeds, read: open },
     Reader { name: "torch_pickle", seeds: || vec![PICKLE.to_vec()], read: torch_pickle },
     Reader { name: "dynamic3d", seeds: || vec![dynamic3d()], read: open },
+    Reader { name: "fourdgs", seeds: || written(".4dgs"), read: open },
+    Reader { name: "ksplat", seeds: || vec![KSPLAT.to_vec()], read: open },
     Reader { name: "usdz", seeds: || written(".usdz"), read: open },
     Reader { name: "sog_levels", seeds: || vec![LEVELS.into()], read: sog_levels },
     Reader { name: "foreign", seeds: foreign_seeds, read: |b| drop(foreign::unread("a.splat4d", b)) },
@@ -58,17 +60,20 @@ const LEVELS: &str = r#"{"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.j
 /// A SOG scene of some Gaussians, made by splat-transform 3.7 of numbers of our own.
 const SOG: &[u8] = include_bytes!("../seeds/few.sog");
 
+/// Some Gaussians of our own as GaussianSplats3D 0.4.7 writes them, at compression level 2.
+const KSPLAT: &[u8] = include_bytes!("../seeds/few.ksplat");
+
 /// Most pieces of a streamed scene that are put together: each is the whole seed.
 const PIECES: usize = 64;
 
 /// Opens a file of any kind and shows a time of it.
-fn open(bytes: &[u8]) {
+pub(crate) fn open(bytes: &[u8]) {
     if let Ok(scene) = splat4d::open(bytes) {
         show(&scene);
     }
 }
 
-fn show(scene: &Scene<f32>) {
+pub(crate) fn show(scene: &Scene<f32>) {
     scene.at(Time(scene.clip[0]), &mut Evaluation::default());
 }
 

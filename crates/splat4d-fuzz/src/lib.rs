@@ -10,6 +10,7 @@ mod captures;
 mod formats;
 mod http;
 pub mod mutate;
+mod networks;
 mod runs;
 #[cfg(test)]
 mod sources;
@@ -27,8 +28,15 @@ pub struct Reader {
 }
 
 /// All of them.
-pub const READERS: &[&[Reader]] =
-    &[formats::READERS, captures::READERS, texts::READERS, runs::READERS, trained::READERS, http::READERS];
+pub const READERS: &[&[Reader]] = &[
+    formats::READERS,
+    networks::READERS,
+    captures::READERS,
+    texts::READERS,
+    runs::READERS,
+    trained::READERS,
+    http::READERS,
+];
 
 /// All of them, one by one.
 pub fn readers() -> impl Iterator<Item = &'static Reader> {

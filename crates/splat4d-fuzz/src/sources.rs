@@ -77,7 +77,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("serving.rs", PASSED),
     ("shipped.rs", By(&["poses_bounds"])),
     ("source.rs", By(&["ply", "spz", "splat", "sog_zip", "scene", "playback"])),
-    ("source/bundle.rs", By(&["ply_zip", "sog_meta", "sog_levels"])),
+    ("source/bundle.rs", By(&["ply_zip", "sog_meta", "sog_levels", "research", "research_pickle"])),
     ("still_baseline.rs", By(&["results_json"])),
     ("recording/cache.rs", Not("values of an import, in plain data; what cannot be read is made again")),
     ("recording/colmap.rs", Not("a note of our own that is compared, masks that are copied and a log that is shown")),

@@ -41,9 +41,16 @@ fn read(bytes: &[u8]) -> Result<Opened> {
 }
 
 /// Reads a checkpoint; of 4d-gaussian-splatting, whose clock has no seconds, with these as the first and last one.
-///
-/// Errors: damaged, no Gaussians that are read. [`Dialect::finish`] must follow.
-pub(super) fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
+pub(super) fn open_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
+    read_on(bytes, clip).map(finish)
+}
+
+/// What follows reading, of a checkpoint or of Gaussians whose network is one.
+pub(super) fn finish(opened: Opened) -> Opened {
+    DIALECT.finish(opened)
+}
+
+fn read_on(bytes: &[u8], clip: Option<[f64; 2]>) -> Result<Opened> {
     let torch = Torch::open(bytes)?;
     let root = torch.root();
     if let Some(opened) = rotors::read(&torch, clip)? {

@@ -279,7 +279,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{checkpoint, dynamic3d, ksplat, ply, splat, splatv, spz, usd};
+    use crate::format::{checkpoint, dynamic3d, ksplat, ply, splat, splats4d, splatv, spz, usd};
     use crate::scene::SH;
 
     /// A scene that every dialect can hold.
@@ -293,6 +293,7 @@ mod tests {
         let by_hand = [
             (dynamic3d::DIALECT, dynamic3d::tests::sample(), 2),
             (checkpoint::DIALECT, checkpoint::tests::sample(&gaussians(20, 4)), 20),
+            (splats4d::DIALECT, splats4d::tests::sample(), 21),
             (ksplat::DIALECT, ksplat::tests::sample(&gaussians(20, 4), 1, 1), 20),
         ];
         for dialect in DIALECTS {

@@ -13,13 +13,7 @@ struct Foreign {
 }
 
 /// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
-const FOREIGN: [Foreign; 14] = [
-    Foreign {
-        is: |b| b.starts_with(b"SP4D"),
-        what: "a .splat4d of the program splats4D, another format under a similar name",
-        remedy: "Decode its frames with that program (`splat4d decode FILE --frame N -o N.splat`, where `splat4d` is the \
-                 command of the Python package splats4d) and open the numbered .splat files.",
-    },
+const FOREIGN: [Foreign; 13] = [
     Foreign { is: <[u8]>::is_empty, what: "an empty file", remedy: "Copy or write it again." },
     Foreign {
         // A safetensors file whose header is 640 to 1,408 bytes long begins alike.
@@ -144,9 +138,7 @@ mod tests {
     #[test]
     fn files_of_other_programs_are_named() {
         for (bytes, name, says) in [
-            (&b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}"[..], "a.splat4d", "splats4D"),
-            (b"SP4D", "a.s4d", "splats4D"),
-            (b"SPLAT4D\0", "a.splat4d", "another program"),
+            (&b"SPLAT4D\0"[..], "a.splat4d", "another program"),
             (b"\0\0\0\0", "a.4DGS", "another program"),
             (b"\x80\x02}q\0.", "a.pth", "pickle"),
             (b"", "a.s4d", "empty"),

@@ -35,6 +35,7 @@ pub mod scene;
 pub mod sequence;
 pub mod sog;
 pub mod splat;
+mod splats4d;
 pub mod splatv;
 pub mod spz;
 mod torch;
@@ -69,6 +70,7 @@ pub const DIALECTS: &[Dialect] = &[
     usd::TEXT,
     usd::ARCHIVE,
     fourdgs::DIALECT,
+    splats4d::DIALECT,
     dynamic3d::DIALECT,
     checkpoint::DIALECT,
 ];

@@ -10,8 +10,8 @@ use super::dialect::{Opened, Y_DOWN};
 use super::torch::{Torch, Value};
 use super::warnings::Warnings;
 use crate::layers::{Layer, Scene};
+use crate::motion::Model;
 use crate::motion::native4d::{LONGEST, MAX_HARMONICS, Native4dSpec, SHORTEST, TABLE};
-use crate::motion::{Spec, build};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::time::DEFAULT_FPS;
 use crate::scene::{GEOMETRY, LifeKind, Params, SH};
@@ -68,7 +68,7 @@ pub(super) fn read(torch: &Torch<'_>, clip: Option<[f64; 2]>) -> Result<Option<O
     let (min_life, max_life) = (SHORTEST, LONGEST);
     let spec =
         Native4dSpec { speed: 1.0 / unit, min_life, max_life, harmonics, period: clip[1] - clip[0], split_time: true };
-    let motion = build(&Spec::Native4d(spec), &mut params)?;
+    let motion = spec.build(&mut params)?;
     let own = params.find(TABLE).expect("the model has made its table");
     for row in 0..rows {
         let left = params[GEOMETRY].read::<4>(row, QUAT);
@@ -155,3 +155,6 @@ impl Tuple<'_> {
         Ok(params)
     }
 }
+
+#[cfg(test)]
+mod tests;

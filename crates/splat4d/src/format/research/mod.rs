@@ -78,7 +78,7 @@ const PROGRAMS: [Program; 3] = [
 /// Errors: damaged files; networks of other programs, or with parts that are not read (`Unsupported`).
 pub fn read(gaussians: &[u8], network: &[u8], settings: &str, clip: Option<[f64; 2]>) -> Result<Opened> {
     if gaussians.is_empty() {
-        return checkpoint::read_on(network, clip).map(|opened| checkpoint::DIALECT.finish(opened));
+        return checkpoint::open_on(network, clip);
     }
     read_trained(Trained { gaussians, network, settings }, clip)
 }
@@ -108,7 +108,7 @@ fn read_trained(files: Trained<'_>, clip: Option<[f64; 2]>) -> Result<Opened> {
     let scene =
         Scene { layers: vec![layer], clip: job.clip, fps: DEFAULT_FPS, offset: info.offset, ..Scene::default() };
     let opened = Opened { up: Some(up), ..Opened::from((scene, warnings)) };
-    Ok(checkpoint::DIALECT.finish(opened))
+    Ok(checkpoint::finish(opened))
 }
 
 fn unsupported(what: impl Into<String>) -> Error {
