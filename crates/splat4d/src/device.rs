@@ -53,7 +53,7 @@ pub fn cpu(config: RenderConfig) -> Box<dyn Backend> {
 /// The requested device, if it has these abilities, or else the CPU.
 pub fn open(device: Device, config: RenderConfig, abilities: &Abilities, tables: Tables) -> Opened {
     if device == Device::Cpu {
-        let why = format!("drawing on {CPU}");
+        let why = format!("rendering on {CPU}");
         return Opened { backend: cpu(config), name: CPU.into(), why, fell_back: false };
     }
     or_cpu(config, gpu(device, config, abilities, tables))
@@ -62,7 +62,7 @@ pub fn open(device: Device, config: RenderConfig, abilities: &Abilities, tables:
 /// A GPU and its name, or, where there is none, the CPU and why.
 fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Opened {
     match gpu {
-        Ok((backend, name)) => Opened { backend, why: format!("drawing on {name}"), name, fell_back: false },
+        Ok((backend, name)) => Opened { backend, why: format!("rendering on {name}"), name, fell_back: false },
         Err(reason) => on_cpu(config, &reason),
     }
 }

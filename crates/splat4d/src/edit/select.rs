@@ -501,7 +501,7 @@ mod tests {
     #[test]
     fn unreadable_input_is_located() {
         for (text, word) in [
-            ("", "ends"),
+            ("", "found the end"),
             ("bux(1)", "bux"),
             ("box(1,2,3)", "6 numbers"),
             ("box(1,2,3,4,5,6", "missing"),
