@@ -674,7 +674,7 @@ fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     assert!(splat4d(&["info", str(&old)]).run().ok().contains("playback file"));
     std::fs::write(&old, b"SP4D\x01\0\0\0\x0c\x02\0\0{\"n\":40}").unwrap();
     let told = splat4d(&["info", str(&old)]).run().refused();
-    assert!(told.contains("splats4D") && told.contains("decode"), "{told}");
+    assert!(told.contains("splats4D") && told.contains("damaged"), "{told}");
 }
 
 #[test]

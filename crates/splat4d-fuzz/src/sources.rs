@@ -29,7 +29,6 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("capture/json.rs", By(&["capture_json", "transforms_json", "nerfies_dataset", "polycam_json", "record3d_json"])),
     ("capture/n3dv.rs", By(&["poses_bounds", "import_note"])),
     ("capture/nerfies.rs", By(&["nerfies_points"])),
-    ("capture/panoptic.rs", By(&["panoptic_points"])),
     ("capture/picture.rs", By(&["picture", "image_file", "mask_png", "labels_png"])),
     ("capture/points.rs", By(&["ply_points"])),
     ("capture/splits.rs", By(&["split_list", "nerfies_split"])),

@@ -146,7 +146,7 @@ fn no_output_replaces_an_input() {
     let (list, other) = (at("list.toml"), at("other.s4d"));
     splat4d(&["bake", str(&ply), "-o", str(&other)]).run().ok();
     let before = std::fs::read(&other).unwrap();
-    let merge = "[[edit]]\ndo = \"merge\"\nscene = \"other.s4d\"\nname = \"second\"\nat = 0.0\n";
+    let merge = "version = 1\n[[edit]]\ndo = \"merge\"\nscene = \"other.s4d\"\nname = \"second\"\nat = 0.0\n";
     std::fs::write(&list, merge).unwrap();
     let said = splat4d(&["edit", str(&ply), str(&list), "-o", str(&other)]).run().refused();
     assert!(said.contains("the output is what is read") && std::fs::read(&other).unwrap() == before, "{said}");

@@ -404,7 +404,7 @@ fn unsupported_inputs_are_refused_with_a_reason() {
     assert!(refused(&one, &["--rig", "fixed"]).contains("one fixed camera"));
     let alone = refused(&one, &[]);
     assert!(alone.contains("stays in place") && alone.contains("--rig moving"), "{alone}");
-    assert!(refused(&films, &["--from", "3", "--to", "2"]).contains("come after"));
+    assert!(refused(&films, &["--from", "3", "--to", "2"]).contains("is empty"));
     assert!(refused(&films, &["--apart", "cam06"]).contains("left,right=2.4"));
     assert!(refused(&films, &["--apart", "cam06,cam99=2"]).contains("cam99"));
     let twice = splat4d(&["import", str(&one), str(&one), "-o", str(&take)]).run().refused();

@@ -88,7 +88,10 @@ pub(super) fn check_no_capture(output: &Path, inputs: &[Input<'_>]) -> Result<()
         .remedy("Choose a folder apart from all captures, with -o"))
 }
 
-/// Folders below one, up to two levels deep, those of our own state aside.
+/// Folder of an import's working files, in its output.
+const IMPORT_NOTES: &str = "import";
+
+/// Folders below one, up to two levels deep, except those of splat4d's own state.
 fn folders_below(folder: &Path) -> Vec<PathBuf> {
     let inner = |of: &Path| -> Vec<PathBuf> {
         let entries = std::fs::read_dir(of).into_iter().flatten().flatten();
@@ -100,7 +103,9 @@ fn folders_below(folder: &Path) -> Vec<PathBuf> {
         found.sort();
         found
     };
-    let first = inner(folder);
+    // An import keeps copies of images here.
+    let is_notes = |f: &PathBuf| folder.join(STATE).is_dir() && f.file_name().is_some_and(|n| n == IMPORT_NOTES);
+    let first: Vec<PathBuf> = inner(folder).into_iter().filter(|f| !is_notes(f)).collect();
     let second = first.iter().flat_map(|f| inner(f));
     first.iter().cloned().chain(second).take(MOST_FOLDERS).collect()
 }
