@@ -154,7 +154,7 @@ impl Conversion {
 }
 
 impl Conversion {
-    /// Which way is up in a file: as the option says, else as the program expects it where the format leaves it open.
+    /// Which way is up in a file: as the option states, else as the program expects it where the format leaves it open.
     fn up_in(&self, target: Target) -> Up {
         match (self.up, self.program, target) {
             (Up::Format, Some(program), Target::Dialect(d)) if !d.fixed_axes => Up::Axis(program.up),

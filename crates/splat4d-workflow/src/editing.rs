@@ -178,7 +178,7 @@ impl<'a> Bring<'a> {
         path
     }
 
-    /// The files that steps have named so far.
+    /// The files that previous steps have named.
     fn read(&self) -> Vec<PathBuf> {
         self.read.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

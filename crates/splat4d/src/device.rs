@@ -71,7 +71,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
 /// that fails is not used again. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     let opened = open(device, config, &Abilities { backward: true, ..Abilities::default() }, Tables::Changing);
-    let why = opened.why.replacen("drawing", "training", 1);
+    let why = opened.why.replacen("rendering", "training", 1);
     match device == Device::Cpu || opened.fell_back {
         true => Opened { why, ..opened },
         false => Opened { backend: Box::new(WithCpu::new(opened.backend)), why, name: opened.name, fell_back: false },

@@ -92,7 +92,7 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
     Ok(cloud)
 }
 
-/// The number that stands for full colour in colours of floating point: 1, or 255 where most are above 1.
+/// The number that represents full colour in colours of floating point: 1, or 255 where most are above 1.
 fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
     let (above, all) = colors.fold((0usize, 0usize), |(above, all), c| (above + usize::from(c > 1.0), all + 1));
     if 2 * above > all { 255.0 } else { 1.0 }

@@ -270,7 +270,7 @@ impl<'a> Judge<'a> {
         let antialias = if options.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
         let Opened { backend, name, why, fell_back } = device::open_to_train(options.device, config);
-        let why = why.replacen("training", "measuring", 1).replacen("drawing", "measuring", 1);
+        let why = why.replacen("training", "measuring", 1).replacen("rendering", "measuring", 1);
         match options.device {
             Device::Cpu => {}
             Device::Gpu if fell_back => listen(&Event::Warning { message: why }),

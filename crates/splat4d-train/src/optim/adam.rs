@@ -9,27 +9,24 @@ use splat4d::scene::table::TableMut;
 use splat4d::scene::{BLOCK, Key, Table};
 use splat4d::simd::{Kernel, each};
 
-/// Decay of the first moment. Kingma and Ba use 0.9; a shorter memory follows the few images of a run faster, and Gaussians are born
-/// without one (studies/records/2026-11-27-optimiser.md).
-const BETA1: f64 = 0.8;
-/// Decay of the second moment. Kingma and Ba use 0.999, for longer runs: a Gaussian that is visible in a third of 3,000 steps
-/// would remember the gradients of its first position for good (studies/records/2026-11-27-optimiser.md).
-const BETA2: f64 = 0.99;
-/// Both decays for cameras (poses, focal lengths, time offsets), as Kingma and Ba state them.
-const CAMERA_BETAS: [f64; 2] = [0.9, 0.999];
+/// Decays of the moments of Gaussians and exposures. Kingma and Ba use 0.9 and 0.999, for longer runs: a Gaussian that is visible in a third of
+/// 3,000 steps would never forget the gradients of its first position (studies/records/2026-11-27-optimiser.md).
+pub(crate) const GAUSSIANS: [f64; 2] = [0.8, 0.99];
+/// Those of networks, nodes and cameras, which take a step nearly every time (Kingma and Ba 2015).
+pub(crate) const OTHERS: [f64; 2] = [0.9, 0.999];
 /// Added to the root of the second moment (Kerbl et al. 2023 use 1e-15: gradients of single Gaussians are tiny).
 const EPSILON: f64 = 1e-15;
 
 type Lane<F> = [F; BLOCK];
 
-/// c₁ and c₂ by step count, up to the count from which both are exactly 1 (some 1,700 in f32: 13 kB).
-pub(crate) fn corrections<F: Real>() -> Vec<[F; 2]> {
+/// c₁ and c₂ by step count, up to the count from which both are exactly 1 (with 0.999 some 17,000 in f32: 130 kB).
+pub(crate) fn corrections<F: Real>(betas: [f64; 2]) -> Vec<[F; 2]> {
     let correction = |beta: f64, n: i32| F::of(1.0 / (1.0 - beta.powi(n)));
     // A row that has taken no step is not active; its entry is never used.
     let mut out = vec![[F::ONE; 2]];
     loop {
         let n = out.len() as i32;
-        out.push([correction(BETA1, n), correction(BETA2, n)]);
+        out.push(betas.map(|beta| correction(beta, n)));
         if out[out.len() - 1] == [F::ONE; 2] {
             return out;
         }
@@ -48,6 +45,8 @@ pub(super) struct Rule<'a, F> {
     pub active: Option<&'a [bool]>,
     /// See [`corrections`].
     pub corrections: &'a [[F; 2]],
+    /// Decays of the moments.
+    pub betas: [F; 2],
 }
 
 /// Some blocks of parameters [W], moments [2W + 1] and gradients [W]; returns the number of blocks with a number that
@@ -118,7 +117,7 @@ fn step_block<F: Real, const FULL: bool>(
         if rate == F::ZERO {
             continue;
         }
-        let [m1, m2, x] = step_lanes([first[c], second[c], p[c], d[c]], rate, &correct1, &correct2);
+        let [m1, m2, x] = step_lanes([first[c], second[c], p[c], d[c]], rate, rule.betas, &correct1, &correct2);
         if FULL {
             (first[c], second[c], p[c]) = (m1, m2, x);
         } else {
@@ -142,8 +141,14 @@ fn step_block<F: Real, const FULL: bool>(
 /// First moment, second moment and parameter after the step. All are passed by value: through references, LLVM would
 /// check at run time whether they overlap.
 #[inline(always)]
-fn step_lanes<F: Real>([m1, m2, p, d]: [Lane<F>; 4], rate: F, c1: &Lane<F>, c2: &Lane<F>) -> [Lane<F>; 3] {
-    let (beta1, beta2, epsilon) = (F::of(BETA1), F::of(BETA2), F::of(EPSILON));
+fn step_lanes<F: Real>(
+    [m1, m2, p, d]: [Lane<F>; 4],
+    rate: F,
+    [beta1, beta2]: [F; 2],
+    c1: &Lane<F>,
+    c2: &Lane<F>,
+) -> [Lane<F>; 3] {
+    let epsilon = F::of(EPSILON);
     let mut out = [[F::ZERO; BLOCK]; 3];
     for l in 0..BLOCK {
         let a = beta1 * m1[l] + (F::ONE - beta1) * d[l];
@@ -163,8 +168,8 @@ pub(crate) fn step_row<const N: usize>(table: &mut Table<f32>, row: usize, d: [f
     }
     let steps = table.get(row, 3 * N) + 1.0;
     table.set(row, 3 * N, steps);
-    let [beta1, beta2] = CAMERA_BETAS;
-    let unbias = CAMERA_BETAS.map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
+    let [beta1, beta2] = OTHERS;
+    let unbias = OTHERS.map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
     for k in 0..N {
         let old = |col| f64::from(table.get(row, col));
         let first = beta1 * old(N + k) + (1.0 - beta1) * d[k];

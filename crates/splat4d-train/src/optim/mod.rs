@@ -6,7 +6,7 @@
 mod adam;
 mod noise;
 
-pub(crate) use adam::{corrections, step_row};
+pub(crate) use adam::{GAUSSIANS, corrections, step_row};
 pub(crate) use noise::{MCMC_EXTENT, Noise};
 
 use splat4d::math::Real;
@@ -22,8 +22,10 @@ pub struct Moments<F = f32> {
     tables: Vec<Table<F>>,
     /// Rows of every table, those included that have none yet.
     rows: Vec<usize>,
-    /// By step count; made by the first step.
-    corrections: Vec<[F; 2]>,
+    /// By step count, of Gaussians and of everything else; made by the first step.
+    corrections: [Vec<[F; 2]>; 2],
+    /// Whether all tables have the decays of Gaussians.
+    alike: bool,
 }
 
 impl<F: PartialEq> PartialEq for Moments<F> {
@@ -53,7 +55,12 @@ impl<F: Real> Moments<F> {
             Table::with_columns(columns.to_vec(), if p.info(key).page.is_some() { 0 } else { p[key].rows() })
         };
         let rows = p.keys().map(|k| p[k].rows()).collect();
-        Self { tables: p.keys().map(table).collect(), rows, corrections: Vec::new() }
+        Self { tables: p.keys().map(table).collect(), rows, corrections: Default::default(), alike: false }
+    }
+
+    /// The same with the decays of Gaussians for all tables: for what is used as rarely as a Gaussian is visible.
+    pub(crate) fn rarely_used(self) -> Self {
+        Self { alike: true, ..self }
     }
 
     /// The moments of one table, [rows, 2W + 1]; no rows for a page that has not learnt.
@@ -126,8 +133,9 @@ impl<F: Real> Moments<F> {
         rates: &[Option<Vec<f64>>],
         floors: &[Floor],
     ) -> Vec<Key> {
-        if self.corrections.is_empty() {
-            self.corrections = corrections();
+        const BETAS: [[f64; 2]; 2] = [GAUSSIANS, adam::OTHERS];
+        if self.corrections[0].is_empty() {
+            self.corrections = BETAS.map(corrections);
         }
         let (mut bad, simd) = (Vec::new(), Simd::detect());
         for key in p.keys() {
@@ -139,12 +147,14 @@ impl<F: Real> Moments<F> {
             assert_eq!(rates.len(), width, "a rate a column is needed");
             let space = p.info(key).space;
             let Some((gradient, active)) = d.drain(key, space) else { continue };
+            let kind = usize::from(space != Space::Gaussians && !self.alike);
             let rule = adam::Rule {
                 rates,
                 floors,
                 key,
                 active: (space != Space::Fixed).then_some(active),
-                corrections: &self.corrections,
+                corrections: &self.corrections[kind],
+                betas: BETAS[kind].map(F::of),
             };
             let rows = self.rows[key.0 as usize];
             if self.tables[key.0 as usize].rows() < rows {

@@ -12,7 +12,8 @@ fn default_of_then() -> Recipe {
     Recipe::default().with(|r| {
         (r.densify.max_cap, r.init.count, r.adc.percent_dense) = (30_000, 10_000, 0.01);
         (r.rates.position_init, r.rates.position_final) = (2e-3, 5e-5);
-        (r.rates.feature, r.rates.scaling, r.rates.rotation) = (6e-3, 0.015, 1e-3);
+        (r.rates.feature, r.rates.scaling, r.rates.rotation, r.rates.opacity) = (6e-3, 0.015, 1e-3, 0.05);
+        (r.appearance.sh_degree, r.life.width_lr, r.spacetime.velocity_lr_final) = (1, 0.02, 1.6e-5);
     })
 }
 

@@ -7,7 +7,7 @@ use super::engine::{
     rates_of,
 };
 use crate::loss::terms::ResidentLoss;
-use crate::optim::corrections;
+use crate::optim::{GAUSSIANS, corrections};
 use crate::train_state::{Parts, TrainState};
 use crate::{ErrorKind, Result};
 use splat4d::device::ResidentMotion;
@@ -117,7 +117,7 @@ impl<'a> DeviceEngine<'a> {
             let table = ResidentTable { width: params.width(), params: params.data(), moments: moments.data() };
             ResidentCameras { count: params.rows(), table, held: exposure.trained() }
         });
-        resident.keep(&layers, cameras.as_ref(), &corrections::<f32>())?;
+        resident.keep(&layers, cameras.as_ref(), &corrections::<f32>(GAUSSIANS))?;
         self.newest = Newest::Both;
         Ok(())
     }

@@ -114,7 +114,7 @@ impl Exposure {
         let key = params
             .entry("exposure", Space::Fixed, &[("exposure", COLUMNS)], cameras, |_| {})
             .expect("a new table fits itself");
-        Self { moments: Moments::new(&params), grads: Grads::new(&params), params, key, trained }
+        Self { moments: Moments::new(&params).rarely_used(), grads: Grads::new(&params), params, key, trained }
     }
 
     /// The table's key.

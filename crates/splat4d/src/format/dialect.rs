@@ -179,7 +179,7 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files that are
+    /// What [`open`](Self::open) does after reading: sets the up direction and repairs values at the edge. For files that are
     /// read with others next to them.
     pub(crate) fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);

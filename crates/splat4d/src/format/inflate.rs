@@ -4,7 +4,7 @@ use flate2::read::ZlibDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use std::io::Read;
 
-/// Largest zstd window that is granted, bytes: what RFC 8878 (3.1.1.1.2) asks every decoder to support. A larger one is
+/// Largest zstd window that is granted, bytes: what RFC 8878 (3.1.1.1.2) requires every decoder to support. A larger one is
 /// granted up to the plain length.
 const WINDOW: u64 = 8 << 20;
 

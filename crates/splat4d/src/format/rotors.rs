@@ -3,7 +3,7 @@
 //!
 //! Gaussians of space and time become [`crate::motion::native4d`]. Their rotation X ↦ l X r̄ has X = t + zi + yj + xk, ours
 //! t + xi + yj + zk: swapping i and k reverses products, so that our left quaternion is their right one with x and z swapped,
-//! conjugated, and the other way round. Their renderer leaves out what has faded below 0.05, ours below 1/255 of opacity.
+//! conjugated, and vice versa. Their renderer leaves out what has faded below 0.05, ours below 1/255 of opacity.
 //! Sources: graphdeco-inria/gaussian-splatting and fudan-zvg/4d-gaussian-splatting (MIT), scene/gaussian_model.py, read for facts.
 
 use super::dialect::{Opened, Y_DOWN};

@@ -65,7 +65,7 @@ fn signed(symbol: u32) -> i32 {
     (symbol >> 1) as i32 ^ -((symbol & 1) as i32)
 }
 
-/// What the JSON says.
+/// Content of the JSON.
 struct Header {
     rows: usize,
     frames: usize,
@@ -311,7 +311,7 @@ pub(super) mod tests {
         (2, symbols.len(), compress_to_vec(&planes[..], CompressionLevel::Fastest))
     }
 
-    /// Gaussian i stands at (i, 0, 0) and, where i is a multiple of 4, goes up by 0.1 a frame; Gaussian 1 fades from 200 to 0.
+    /// Gaussian i is at (i, 0, 0) and, where i is a multiple of 4, rises by 0.1 a frame; Gaussian 1 fades from 200 to 0.
     pub(in crate::format) fn sample() -> Vec<u8> {
         let moving: Vec<usize> = (0..ROWS).step_by(4).collect();
         let mut base = Vec::new();

@@ -49,7 +49,7 @@ pub struct WarpSpec {
     pub width: usize,
     /// Hidden layers.
     pub layers: usize,
-    /// The input stands again behind what this hidden layer gives.
+    /// The input is appended again to the output of this hidden layer.
     pub skip: Option<usize>,
     /// Levels of the encodings of position and time.
     pub levels: [usize; 2],
@@ -272,7 +272,7 @@ impl<F: Real> Motion<F> for Warp {
 }
 
 fn heads<F: Real>(cache: &Cache, t: Time) -> &[F] {
-    let passes: &Passes<F> = cache.get().expect("prepare comes before every question");
+    let passes: &Passes<F> = cache.get().expect("prepare runs before every query");
     let found = passes.0.iter().find(|(time, _)| time.0.to_bits() == t.0.to_bits());
     &found.expect("every time of a step was prepared").1
 }

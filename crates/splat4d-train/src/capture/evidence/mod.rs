@@ -159,7 +159,7 @@ impl Capture {
         self.conclude(&conventions, &measures)
     }
 
-    /// The frames that are examined first, of a capture of so many places: cameras of one time in their order, or frames of a moving
+    /// The frames that are examined first, of a capture with this number of places: cameras of one time in their order, or frames of a moving
     /// camera in a row.
     fn looked_at(&self, places: usize) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);

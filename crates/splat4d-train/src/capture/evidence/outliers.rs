@@ -14,7 +14,7 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Captures of at most so many places are compared image by image; of larger ones the conspicuous poses.
+/// Captures of at most this many places are compared image by image; of larger ones the conspicuous poses.
 pub(super) const ALL: usize = 24;
 /// Conspicuous poses that are looked into at most, and of all places: where more are so, it is how the capture is.
 const SUSPECTS: usize = 4;
@@ -61,7 +61,7 @@ impl Sign {
     }
 }
 
-/// Looks for single wrong poses among the places `order`; `images` are images that are read already.
+/// Searches for single wrong poses among the places `order`; `images` are images that are read already.
 pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
     let signs = signs(capture, order);
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);

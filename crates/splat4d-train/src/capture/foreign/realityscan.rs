@@ -17,7 +17,7 @@ pub(super) const EXPORT: Export = Export { find, is, read };
 
 /// Columns that such a file has.
 const COLUMNS: [&str; 10] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py"];
-/// How many of them a file has at least, in one of so many first lines, which is meant to be such a file.
+/// How many of them a file has at least, in one of this many first lines, to be taken for such a file.
 const MEANT: usize = 7;
 const HEADER_LINES: usize = 5;
 /// Other names of columns.

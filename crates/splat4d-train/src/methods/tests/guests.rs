@@ -174,7 +174,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
 }
 
 /// A ghost is seen where the error is above this; objects themselves may be this far off.
-const GHOST: f64 = 0.06;
+const GHOST: f64 = 0.08;
 const OFF: f64 = 0.12;
 
 #[test]

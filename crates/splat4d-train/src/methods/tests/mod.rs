@@ -51,7 +51,7 @@ fn every_built_in_model_has_a_program() {
     for (name, make) in PROGRAMS {
         assert_eq!(make(&Recipe::default()).spec(&plan).name(), name, "a program is listed under its model's name");
     }
-    assert!(Recipe::default().program_of("warp").is_err_and(|e| e.to_string().contains("spacetime")));
+    assert!(Recipe::default().program_of("wobble").is_err_and(|e| e.to_string().contains("spacetime")));
 }
 
 #[test]

@@ -72,7 +72,7 @@ fn a_map_that_the_images_contradict_is_reported() {
     };
     let wrong = warnings("wrong", 2.0);
     assert!(wrong.len() == 1 && wrong[0].contains("contradicts") && wrong[0].contains("frame"), "{wrong:?}");
-    let ratio = wrong[0].split("it draws ").nth(1).and_then(|s| s.split(' ').next()).unwrap().parse::<f64>().unwrap();
+    let ratio = wrong[0].split("it renders ").nth(1).and_then(|s| s.split(' ').next()).unwrap().parse::<f64>().unwrap();
     assert!((0.4..0.6).contains(&ratio), "{wrong:?}");
     assert_eq!(warnings("right", 1.0), Vec::<String>::new());
 }

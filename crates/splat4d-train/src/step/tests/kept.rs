@@ -5,7 +5,7 @@ use crate::loss::graph::Weigh;
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ResidentLoss, StepInfo};
 use crate::loss::tracked::{Ties, Tracking, Weights};
-use crate::optim::{Noise, corrections};
+use crate::optim::{GAUSSIANS, Noise, corrections};
 use crate::train_state::TrainState;
 use splat4d::device::{self, Device};
 use splat4d::layers::{Layer, Scene};
@@ -22,7 +22,7 @@ use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LifeKind, Params, Planes, Row
 /// Largest relative difference of a gradient, or of what noise adds, as a vector: roundings of 32 bits.
 const VECTOR: f64 = 1e-5;
 /// Adam's share of a gradient in the first moment.
-const FIRST: f64 = 0.1;
+const FIRST: f64 = 0.2;
 const ROWS: usize = 700;
 const NO_VIEW: [f32; 3] = [0.2, 0.5, 0.9];
 
@@ -74,7 +74,7 @@ fn step(
     });
     let stats = train_state.stats().tables[0].data();
     let kept = ResidentLayer { rows: ROWS, moves: Moves::Posed, life: LifeKind::Infinite, tables, stats, ties };
-    resident.keep(&[kept], None, &corrections::<f32>()).unwrap();
+    resident.keep(&[kept], None, &corrections::<f32>(GAUSSIANS)).unwrap();
     let away = Se3::look_at([0.0, 0.0, 50.0], [0.0, 0.0, 90.0], [0.0, 1.0, 0.0]);
     let camera = Camera::with_fov_y(away, 0.8, 32, 24);
     let truth = Planes::new(3, 24, 32);

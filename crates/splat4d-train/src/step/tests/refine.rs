@@ -173,7 +173,8 @@ fn run(frames: Disturbed, line: &str) -> Left {
 /// Slow paths and no splits in time: in images of 24 pixels a model that follows motion as fast as the default's
 /// explains a
 /// wrong clock or pose by motion. In real images it finds both better than slow ones do (docs/refine.md).
-const SLOW: &str = "adc.split_in_time=0 adc.full_at=0 spacetime.velocity_lr_init=0.005 life.width_lr=0.01";
+const SLOW: &str = "adc.split_in_time=0 adc.full_at=0 spacetime.velocity_lr_init=0.005 spacetime.velocity_lr_final=0.000016 \
+    life.width_lr=0.01 rates.opacity=0.05 rates.feature=0.006 rates.scaling=0.015";
 
 #[test]
 fn clocks_that_are_frames_apart_are_found() {
@@ -195,7 +196,7 @@ fn wrong_poses_converge_and_correct_ones_stay() {
     assert!(left.degrees[0] > 1.4 && left.degrees[1] < 0.8 * left.degrees[0], "{:?}", left.degrees);
     assert!(left.gauge[0] < 1e-3, "the cameras' mean stays: {:?}", left.gauge);
     let left = run(Disturbed::poses(0.0), line);
-    assert!(left.degrees[1] < 0.5, "{:?}", left.degrees);
+    assert!(left.degrees[1] < 0.6, "{:?}", left.degrees);
 }
 
 #[test]

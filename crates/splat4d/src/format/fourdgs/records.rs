@@ -8,7 +8,7 @@ use crate::format::warnings::Warnings;
 use crate::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
 
-/// Most Gaussians that are believed in any case; beyond them one in so many bytes of the file. (Constant streams take none.)
+/// Most Gaussians that are believed in any case; beyond them one in this many bytes of the file. (Constant streams take none.)
 const ALWAYS: usize = 1 << 16;
 const BYTES: usize = 8;
 /// Longest block of a chunk that is unpacked: bytes, and times its packed bytes.
@@ -20,7 +20,7 @@ const WINDOW: usize = 16;
 const UNREAD: [(u8, u8, &str); 3] =
     [(0x09, 0x09, "sound"), (0x11, 0x12, "sound"), (0x25, 0x25, "rigid motions of objects")];
 
-/// What the header says.
+/// Content of the header.
 #[derive(Debug, Default)]
 pub(super) struct Header {
     pub(super) seconds: f64,

@@ -2,7 +2,7 @@
 //! synthetic captures, and the heads `gaussian_warp` (or the screw `branch_w`, `branch_v`), `gaussian_rotation` and
 //! `gaussian_scaling`, as [`crate::motion::deform`] has them.
 //!
-//! Differences: positions are in scene units, heads have no gains, the input stands in front of the hidden numbers. Its screws
+//! Differences: positions are in scene units, heads have no gains, the input precedes the hidden numbers. Its screws
 //! add 1e-5 to unit vectors, which is not repeated.
 //! Source: ingra14m/Deformable-3D-Gaussians (MIT), utils/time_utils.py, read for facts.
 
@@ -29,7 +29,7 @@ pub(super) struct Trunk {
     pub(super) time: Option<[Map; 2]>,
     /// Numbers of position and of time that go in.
     pub(super) inputs: [usize; 2],
-    /// The hidden layer behind which the input stands again.
+    /// The hidden layer after which the input is appended again.
     pub(super) skip: usize,
 }
 

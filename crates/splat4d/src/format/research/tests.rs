@@ -89,7 +89,7 @@ struct Seen {
     sh: Vec<f64>,
 }
 
-/// Compares a scene with what the network says of every Gaussian, at ten times.
+/// Compares a scene with the output of the network for every Gaussian, at ten times.
 fn check(scene: &Scene<f32>, expected: impl Fn(usize, f64) -> Seen) {
     let [from, to] = scene.clip;
     for step in 0..10 {
