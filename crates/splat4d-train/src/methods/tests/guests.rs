@@ -103,6 +103,8 @@ fn recipe(motion: &str, life: &str) -> Recipe {
         r.densify.max_cap = 1000;
         r.init.source = Source::Points;
         r.init.opacity = 0.3;
+        // In 400 steps nodes follow only slow lifespans.
+        (r.rates.opacity, r.life.width_lr, r.rates.position_init) = (0.05, 0.02, 2e-3);
         // Small networks and planes: three balls are to be learnt.
         r.deform.width = 64;
         (r.hexplane.plane_channels, r.hexplane.plane_resolution, r.hexplane.net_width) = (16, 16, 32);
