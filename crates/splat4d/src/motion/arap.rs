@@ -2,8 +2,8 @@
 //! neighbourhood keeps its shape.
 //!
 //! Minimises E = Σ_k Σ_j∈N(k) w_kj ‖(p'_k − p'_j) − R_k (p_k − p_j)‖² over positions p' and rotations R by turns: the
-//! best rotation of every neighbourhood (Procrustes), then the best positions, Σ_j w_kj (p'_k − p'_j) = ½ Σ_j w_kj (R_k
-//! + R_j)(p_k − p_j), by conjugate gradients with the handles' rows eliminated. Neither step can raise E. Weights are
+//! best rotation of every neighbourhood (Procrustes), then the best positions, Σ_j w_kj (p'_k − p'_j) = ½ Σ_j w_kj
+//! (R_k + R_j)(p_k − p_j), by conjugate gradients with the handles' rows eliminated. Neither step can raise E. Weights are
 //! symmetric, so that the matrix is. Everything is f64 and in a fixed order.
 //! Source: Sorkine and Alexa 2007; graph as SC-GS (Huang et al. 2024), whose weights are not symmetric.
 

@@ -153,7 +153,7 @@ fn header_of(c: &mut Cursor<'_>) -> Result<Header> {
         f64_of(c)?;
     }
     let (degree, _flags) = (usize::from(c.u8()?), c.u8()?);
-    if !(seconds.is_finite() && seconds >= 0.0) || !(cutoff > 0.0 && cutoff <= 1.0) || degree > 3 {
+    if !(seconds.is_finite() && seconds >= 0.0 && cutoff > 0.0 && cutoff <= 1.0) || degree > 3 {
         return Err(damaged(format!("{seconds} s, cutoff {cutoff}, degree {degree}")));
     }
     Ok(Header { seconds, cutoff, degree, attributes: map(c)? })
