@@ -1,8 +1,8 @@
 //! Compression: a trained scene loses its least important Gaussians, becomes a playback file, and is fine-tuned as that
 //! file.
 //!
-//! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et al.
-//! 2025).
+//! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et
+//!    al. 2025).
 //! 2. The scene is baked and written, and the decoded file replaces it: a layer per page, rows in the file's order,
 //!    from any model. Masks state which Gaussians the training views show around which key time.
 //! 3. Fine-tuning through the file's codes: renders show the decoded file, gradients go to the values before rounding

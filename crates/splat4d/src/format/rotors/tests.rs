@@ -52,9 +52,8 @@ fn saved(first: &Tensors, between: usize, second: &Tensors, rotates: Option<bool
     // The optimiser and the size of the scene.
     p.extend(b"}K\x05");
     second.iter().for_each(|t| put(&mut p, t));
-    match rotates {
-        Some(rotates) => p.extend([if rotates { 0x88 } else { 0x89 }, b'N', b'K', 2]),
-        None => {}
+    if let Some(rotates) = rotates {
+        p.extend([if rotates { 0x88 } else { 0x89 }, b'N', b'K', 2]);
     }
     p.extend(b"tK\x07t.");
     files.insert(0, ("chkpnt/data.pkl".into(), p));
