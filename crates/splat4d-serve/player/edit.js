@@ -327,7 +327,10 @@ export class Editing {
   }
 
   #properties() {
-    const step = this.step, keep = this.props.contains(this.ui.focused()) ? this.ui.focused().getAttribute('aria-label') : null;
+    const focused = this.props.contains(this.ui.focused()) ? this.ui.focused() : null, keep = focused?.getAttribute('aria-label');
+    // A changed field sends its value when it loses the focus, which builds the fields again: not while they are being replaced.
+    focused?.blur();
+    const step = this.step;
     this.props.hidden = !step;
     this.panel.classList.toggle('setting', !!step);
     this.props.replaceChildren(...(step ? this.#fields(step) : []));
