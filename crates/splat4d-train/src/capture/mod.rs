@@ -471,6 +471,24 @@ pub(crate) fn is_filmed(path: &Path) -> bool {
     is_folder(path) && (usual() || Capture::open(path, &CaptureOptions::default()).is_ok())
 }
 
+/// Images and videos in a folder and in the folders below it, three levels deep.
+pub(crate) fn films(folder: &Path) -> Vec<PathBuf> {
+    fn collect(folder: &Path, levels: usize, out: &mut Vec<PathBuf>) {
+        out.extend(stray::videos(folder).into_iter().map(|name| folder.join(name)));
+        for name in rig::file_names(folder) {
+            let path = folder.join(&name);
+            if rig::is_image(&name) {
+                out.push(path);
+            } else if levels > 0 && path.is_dir() {
+                collect(&path, levels - 1, out);
+            }
+        }
+    }
+    let mut out = Vec::new();
+    collect(folder, 3, &mut out);
+    out
+}
+
 /// A coloured point cloud from a .ply, .npy or .npz file. Errors: not a point cloud, damage, absurd counts.
 pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {
     points::read_cloud(path)

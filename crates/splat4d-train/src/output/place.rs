@@ -6,6 +6,7 @@
 use super::{STATE, written};
 use crate::capture;
 use crate::{Error, Result};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Files of imports: the capture that they make, and their list of corrections.
@@ -74,11 +75,13 @@ pub(super) fn check_no_capture(output: &Path, inputs: &[Input<'_>]) -> Result<()
     let is_foreign = |folder: &Path| capture::is_filmed(folder) && !holders.contains(&id(folder));
     let (real, missing) = existing_part(output);
     let around = real.ancestors().enumerate().find(|(_, folder)| is_foreign(folder));
+    let own = written(&real);
+    let is_own = |folder: &Path| is_written(&real, folder, &own);
     let (how, found) = match around {
         Some((0, folder)) if missing == 0 => ("is", folder.to_owned()),
         Some((_, folder)) => ("lies inside", folder.to_owned()),
         None if missing > 0 => return Ok(()),
-        None => match folders_below(&real).into_iter().find(|folder| is_foreign(folder)) {
+        None => match folders_below(&real).into_iter().find(|folder| is_foreign(folder) && !is_own(folder)) {
             Some(folder) => ("contains", folder),
             None => return Ok(()),
         },
@@ -88,8 +91,13 @@ pub(super) fn check_no_capture(output: &Path, inputs: &[Input<'_>]) -> Result<()
         .remedy("Choose a folder apart from all captures, with -o"))
 }
 
-/// Folder of an import's working files, in its output.
-const IMPORT_NOTES: &str = "import";
+/// Whether all images and videos of a folder below an output are on the output's list of files: those that an import made for
+/// COLMAP are, also where it was cut off.
+fn is_written(output: &Path, folder: &Path, own: &BTreeSet<PathBuf>) -> bool {
+    let filmed = capture::films(folder);
+    let listed = |file: &PathBuf| file.strip_prefix(output).is_ok_and(|below| own.contains(below));
+    !filmed.is_empty() && filmed.iter().all(listed)
+}
 
 /// Folders below one, up to two levels deep, except those of splat4d's own state.
 fn folders_below(folder: &Path) -> Vec<PathBuf> {
@@ -103,9 +111,7 @@ fn folders_below(folder: &Path) -> Vec<PathBuf> {
         found.sort();
         found
     };
-    // An import keeps copies of images here.
-    let is_notes = |f: &PathBuf| folder.join(STATE).is_dir() && f.file_name().is_some_and(|n| n == IMPORT_NOTES);
-    let first: Vec<PathBuf> = inner(folder).into_iter().filter(|f| !is_notes(f)).collect();
+    let first = inner(folder);
     let second = first.iter().flat_map(|f| inner(f));
     first.iter().cloned().chain(second).take(MOST_FOLDERS).collect()
 }
@@ -246,6 +252,18 @@ mod tests {
         assert!(check_apart(&at("sets/a"), &[]).is_err());
         std::fs::write(at("sets/a/import.toml"), "").unwrap();
         assert!(check_apart(&at("sets/a"), &[]).is_ok() && check("sets/a").is_err());
+        // A model that an import made is its own, whatever it is called; with another image it is the user's.
+        for name in ["import/colmap/images/cam0.png", "import/colmap/transforms.json", ".splat4d/files"] {
+            let path = at("take").join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "import/colmap/images/\nimport/colmap/images/cam0.png\n").unwrap();
+        }
+        assert_eq!(check("take"), Ok(()));
+        std::fs::write(at("take/import/colmap/images/mine.png"), "x").unwrap();
+        assert!(check("take").unwrap_err().contains("contains the capture"));
+        std::fs::remove_file(at("take/import/colmap/images/mine.png")).unwrap();
+        std::fs::remove_file(at("take/.splat4d/files")).unwrap();
+        assert!(check("take").is_err(), "no list, no import");
         // The folder of a calibration may hold what is imported with it.
         for calibration in ["sets/a", "sets/a/transforms.json"] {
             let path = at(calibration);
