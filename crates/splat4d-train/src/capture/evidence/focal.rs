@@ -25,8 +25,12 @@ const ENOUGH: f64 = 30.0;
 const SHARE: f64 = 0.15;
 /// Largest share of the error as read that matches may have at half or twice the focal length, where they determine it.
 const FLAT: f64 = 0.7;
+/// First radial terms that are tried: barrels of action cameras and of wide lenses, and a cushion.
+const BENDS: [f64; 3] = [-0.3, -0.15, 0.15];
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;
+/// The same where distortion is left out or added: fewer alternatives agree by chance.
+const STRAIGHTER: f64 = 0.05;
 
 /// Results for the tried factors of focal lengths, by steps.
 struct Tried(Vec<f64>);
@@ -55,21 +59,35 @@ pub(super) fn check(
     images: &[SmallImage],
     poses: &[Se3],
 ) -> Option<Finding> {
-    by_points(capture, images, poses).or_else(|| by_matches(matches?, images, poses))
+    by_points(capture, matches, images, poses).or_else(|| by_matches(matches?, images, poses))
 }
 
-fn by_points(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
+fn by_points(capture: &Capture, matches: Option<&[Match]>, images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     capture.points.as_ref()?;
-    let gain = |trial: Trial| points::gain_if(capture, images, poses, trial).unwrap_or(0.0);
-    let own = gain(Trial::AS_READ);
+    let measured = |trial: Trial| points::gain_if(capture, images, poses, trial);
+    let own = measured(Trial::AS_READ);
+    // Where too few points are in the images as read, those that come into view with shorter focal lengths may be hidden by
+    // what the images show: colours then agree by chance.
+    let few = own.is_none();
+    let gain = |trial: Trial| match measured(trial) {
+        Some((gain, compared)) if !few || compared >= points::MANY => gain,
+        _ => 0.0,
+    };
+    let own = own.map_or(0.0, |(gain, _)| gain);
+    let least = if few { points::GOOD + COLOURS } else { points::CONVINCES.1 };
     let percent = |gain: f64| 100.0 * gain.max(0.0);
     let as_read = format!("by {:.0} % as read", percent(own));
     let how = |gain: f64| format!("colours of initial points fit their images by {:.0} %", percent(gain));
-    let wrong = |gain: f64| gain >= points::CONVINCES.1 && gain >= own + COLOURS;
+    let matched = || {
+        let [of, all] = matches.map_or([0; 2], |m| [pairs::fitting(m, images, poses), m.len()]);
+        pairs::are_right(of, all)
+    };
+    let better = |gain: f64, by: f64| gain >= least && gain >= own + by && !(few && matched());
+    let wrong = |gain: f64| better(gain, COLOURS);
     // Images that were undistorted, with the cameras of the originals.
     if images.iter().any(SmallImage::is_distorted) {
         let straight = gain(Trial { straight: true, ..Trial::AS_READ });
-        if wrong(straight) {
+        if better(straight, STRAIGHTER) {
             let what = format!(
                 "The distortion of the lenses probably does not apply to these images: {} without it, {as_read}.",
                 how(straight)
@@ -79,19 +97,40 @@ fn by_points(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<
             return Some(warned(what, remedy));
         }
     }
-    let both = Tried::new(|times| gain(Trial { times: [times; 2], ..Trial::AS_READ }));
-    let across = Tried::new(|times| gain(Trial { times: [times, 1.0], ..Trial::AS_READ }));
-    let (best, wide) = (both.best(), across.best());
-    if wrong(across.at(wide)) && across.at(wide) >= both.at(best) + COLOURS {
+    let (both, longer) = best(&|times| gain(Trial { times: [times; 2], ..Trial::AS_READ }));
+    let (across, wider) = best(&|times| gain(Trial { times: [times, 1.0], ..Trial::AS_READ }));
+    let bent = BENDS.map(|bend| (gain(Trial { bend, ..Trial::AS_READ }), bend));
+    let (bent, bend) = bent.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0.0));
+    if better(bent, STRAIGHTER) && bent >= both.max(across) && !images.iter().any(SmallImage::is_distorted) {
         let what = format!(
-            "The focal length across (fx) is probably wrong: {} if it is {:.2} times as long, {as_read}.",
-            how(across.at(wide)),
-            STEP.powi(wide)
+            "The images are probably distorted, and the cameras are not: {} with k1 = {bend}, {as_read}.",
+            how(bent)
+        );
+        return Some(warned(what, "Undistort the images, or export the cameras with their distortion."));
+    }
+    if wrong(across) && across >= both + COLOURS {
+        let what = format!(
+            "The focal length across (fx) is probably wrong: {} if it is {wider:.2} times as long, {as_read}.",
+            how(across)
         );
         let remedy = "Images that were stretched, such as to 16:9, have another focal length across than down.";
         return Some(warned(what, remedy));
     }
-    (best != 0 && wrong(both.at(best))).then(|| warning(&how(both.at(best)), best, images, &as_read))
+    (longer != 1.0 && wrong(both)).then(|| warning(&how(both), longer, images, &as_read))
+}
+
+/// The best result over the factors that are tried, refined by half a step, and its factor.
+fn best(of: &dyn Fn(f64) -> f64) -> (f64, f64) {
+    let coarse = Tried::new(of);
+    let step = coarse.best();
+    [0.0, -0.5, 0.5]
+        .map(|half| {
+            let times = STEP.powf(f64::from(step) + half);
+            (if half == 0.0 { coarse.at(step) } else { of(times) }, times)
+        })
+        .into_iter()
+        .reduce(|best, next| if next.0 > best.0 { next } else { best })
+        .unwrap_or((0.0, 1.0))
 }
 
 fn by_matches(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
@@ -103,7 +142,7 @@ fn by_matches(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option
     }
     if best.abs() > RIGHT && fit.at(best) >= BETTER * fit.at(0) {
         let how = format!("matches between images fit {:.1} times as well", fit.at(best) / fit.at(0).max(1.0));
-        return Some(warning(&how, best, images, "than as read"));
+        return Some(warning(&how, STEP.powi(best), images, "than as read"));
     }
     let flat = fit.at(OCTAVE).max(fit.at(-OCTAVE)) >= FLAT * fit.at(0);
     let percent = |step: i32| 100.0 * fit.at(step) / fit.at(0).max(1.0);
@@ -121,8 +160,8 @@ fn by_matches(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option
     })
 }
 
-fn warning(how: &str, step: i32, images: &[SmallImage], as_read: &str) -> Finding {
-    let (times, own) = (STEP.powi(step), images[0].camera.intrinsics.fx);
+fn warning(how: &str, times: f64, images: &[SmallImage], as_read: &str) -> Finding {
+    let own = images[0].camera.intrinsics.fx;
     let what = format!(
         "Focal lengths are probably wrong: {how} if they are {times:.2} times as long ({:.0} px in place of {own:.0} px), {as_read}.",
         times * own

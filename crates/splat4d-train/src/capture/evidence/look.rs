@@ -143,11 +143,13 @@ pub(super) struct Trial {
     pub(super) times: [f64; 2],
     /// Without the lens's distortion.
     pub(super) straight: bool,
+    /// The first radial term of distortion, where the lens has none; 0: as read.
+    pub(super) bend: f64,
 }
 
 impl Trial {
     /// As they were read.
-    pub(super) const AS_READ: Self = Self { times: [1.0; 2], straight: false };
+    pub(super) const AS_READ: Self = Self { times: [1.0; 2], straight: false, bend: 0.0 };
 }
 
 impl SmallImage {
@@ -234,7 +236,15 @@ impl SmallImage {
         let mut camera = self.camera.clone();
         camera.intrinsics.fx *= trial.times[0];
         camera.intrinsics.fy *= trial.times[1];
-        (camera, if trial.straight { Distortion::new(Lens::Pinhole) } else { self.lens })
+        let lens = match trial {
+            Trial { straight: true, .. } => Distortion::new(Lens::Pinhole),
+            Trial { bend, .. } if bend != 0.0 && !self.is_distorted() => {
+                let k = [bend, 0.0, 0.0, 0.0, 0.0, 0.0];
+                Distortion::new(Lens::Brown { k, p: [0.0; 2], s: [0.0; 4] })
+            }
+            _ => self.lens,
+        };
+        (camera, lens)
     }
 
     /// Whether its lens distorts.

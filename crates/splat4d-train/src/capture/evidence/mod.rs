@@ -65,8 +65,10 @@ impl Capture {
         let mut images = look::take(self, &self.looked_at(order.len()), look::COARSE);
         let mut matches = None;
         let mut check = self.judge(&points::frames(self), &mut images, &mut matches);
-        if check.finding.aspect == Some(Aspect::NotChecked)
+        let by_points = || points::gain_of_all(self, &images).is_some_and(|gain| gain >= points::CONVINCES.1);
+        if check.finding.severity == Severity::Note
             && let Some(matches) = &matches
+            && (check.finding.aspect == Some(Aspect::NotChecked) || by_points())
         {
             let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
             check.finding = pairs::contradiction(matches, &images, &poses).unwrap_or(check.finding);
@@ -120,6 +122,15 @@ impl Capture {
                     .into(),
                 remedy: String::new(),
             }),
+            points::Unit::Inverse(correlation, file) => {
+                let what = format!(
+                    "Depth maps probably hold inverse depths (disparities): their values fall where initial points are farther \
+                     away (correlation {correlation:.2}; such as {}).",
+                    file.path.display()
+                );
+                let remedy = "Write depths, or state depth_kind \"inverse\" in a capture.json (docs/priors.md).";
+                findings.push(warn(what, remedy));
+            }
             points::Unit::Wrong(ratio, by, file) => {
                 let remedy = "State the unit (depth_unit_scale_factor; in capture.json depth_scale).";
                 findings.push(warn(other_unit(ratio, by, file), remedy));
@@ -148,8 +159,8 @@ impl Capture {
             m.points = points::measure(self, (spread, &spread_poses), (images, poses));
             m.foreground = silhouettes::measure(images, poses);
         }
-        // Points whose colours agree suffice.
-        if !measures[0].points.convinces() {
+        // Points whose colours agree well suffice.
+        if !measures[0].points.suffices() {
             let matches = matches.get_or_insert_with(|| {
                 look::describe(images, look::COARSE);
                 pairs::matches(images)

@@ -66,13 +66,18 @@ impl Measure {
 
     /// Whether poses are right by this.
     pub(super) fn convinces(&self) -> bool {
-        self.fitting >= MORE.0 && self.share() >= FITTING
+        are_right(self.fitting, self.matches)
     }
 
     /// Whether matches indicate that the poses as read are better.
     pub(super) fn contradicts(&self) -> bool {
         self.lost >= MORE.0 && self.lost >= MORE.1 * self.gained
     }
+}
+
+/// Whether the number of fitting matches, and their share of all, show that poses are right.
+pub(super) fn are_right(fitting: usize, matches: usize) -> bool {
+    fitting >= MORE.0 && fitting as f64 >= FITTING * matches as f64
 }
 
 /// Whether matches indicate that poses are written in this convention.

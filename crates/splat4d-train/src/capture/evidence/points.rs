@@ -21,7 +21,14 @@ pub(super) const CONVINCES: (f64, f64) = (0.03, MISFIT);
 /// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged
 /// images of one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
 const MISFIT: f64 = 0.2;
-const MANY: usize = 200;
+pub(super) const MANY: usize = 200;
+/// The same where at least this share of the matches between images fits: poses are right then, and points are of
+/// another world or hidden. Parts of real captures gain 0.14 and more, points in another unit 0.07 and less (studies/records, 27
+/// November 2026).
+const MISFIT_OF_MATCHED: f64 = 0.1;
+const MATCHED: f64 = 0.75;
+/// Gain of colours from which points alone show that poses and intrinsics are right; below, matches are compared too.
+pub(super) const GOOD: f64 = 0.3;
 /// Share of points in images below which, of that many points, they are of another scene.
 const APART: f64 = 0.05;
 const FEW: usize = 100;
@@ -57,7 +64,9 @@ impl Measure {
         if self.asked > 0 && self.seen == 0.0 {
             return Some(self.elsewhere());
         }
-        let colours = self.gain.filter(|gain| *gain < MISFIT && self.compared >= MANY);
+        let matched = pairs.convinces() && pairs.share() >= MATCHED;
+        let misfit = if matched { MISFIT_OF_MATCHED } else { MISFIT };
+        let colours = self.gain.filter(|gain| *gain < misfit && self.compared >= MANY);
         let apart = self.asked >= FEW && self.seen < APART && !self.convinces() && !pairs.convinces();
         if colours.is_none() && !apart {
             return None;
@@ -106,6 +115,11 @@ impl Measure {
     /// Whether poses are right by this.
     pub(super) fn convinces(&self) -> bool {
         self.seen >= CONVINCES.0 && self.gain.is_some_and(|g| g >= CONVINCES.1)
+    }
+
+    /// Whether nothing else need be compared.
+    pub(super) fn suffices(&self) -> bool {
+        self.convinces() && self.gain.is_some_and(|g| g >= GOOD)
     }
 }
 
@@ -186,24 +200,52 @@ fn with_depth(capture: &Capture) -> Vec<&Frame> {
     frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect()
 }
 
-/// How many times as far away points are as metric depth maps indicate, and a map's file. `None`: undetermined.
-fn by_points(capture: &Capture) -> Option<f64> {
+/// Correlation of the logarithms of stored and true depths below which maps hold inverse depths: where ratios are steady, and
+/// where they are not.
+const INVERSE: [f64; 2] = [-0.7, -0.5];
+
+/// What points indicate of metric depth maps.
+enum ByPoints {
+    /// How many times as far away points are.
+    Ratio(f64),
+    /// Maps hold inverse depths, by this correlation.
+    Inverse(f64),
+}
+
+/// Compares metric depth maps with points. `None`: undetermined.
+fn by_points(capture: &Capture) -> Option<ByPoints> {
     let cloud = capture.points.as_ref()?;
-    let mut ratios = Vec::new();
+    let (mut ratios, mut logarithms) = (Vec::new(), Vec::new());
     for frame in with_depth(capture) {
         let seen = in_image(frame, cloud.points.iter().step_by(step(cloud)));
         let pixels: Vec<[f64; 2]> = seen.iter().map(|(pixel, _)| *pixel).collect();
         // A map that cannot be read has an error of its own.
         let Ok(depths) = depth::at(frame.depth.as_ref()?, &frame.source, &pixels) else { continue };
-        let known = seen.iter().zip(depths).filter(|(_, d)| *d > 0.0);
-        ratios.extend(known.map(|((_, z), d)| z / f64::from(d)));
+        let known = seen.iter().zip(depths).filter(|(_, d)| *d > 0.0).map(|((_, z), d)| (*z, f64::from(d)));
+        for (z, d) in known {
+            ratios.push(z / d);
+            logarithms.push([z.ln(), d.ln()]);
+        }
     }
     if ratios.len() < IN_MAP {
         return None;
     }
     ratios.sort_by(f64::total_cmp);
     let quarter = |k: usize| ratios[k * ratios.len() / 4];
-    (quarter(3) <= STEADY * quarter(1)).then(|| quarter(2))
+    let (steady, correlation) = (quarter(3) <= STEADY * quarter(1), correlation(&logarithms));
+    if correlation <= INVERSE[usize::from(!steady)] {
+        return Some(ByPoints::Inverse(correlation));
+    }
+    steady.then(|| ByPoints::Ratio(quarter(2)))
+}
+
+/// Pearson's correlation; 0 where one of the two is constant.
+fn correlation(pairs: &[[f64; 2]]) -> f64 {
+    let n = pairs.len().max(1) as f64;
+    let mean = [0, 1].map(|k| pairs.iter().map(|p| p[k]).sum::<f64>() / n);
+    let moment = |a: usize, b: usize| pairs.iter().map(|p| (p[a] - mean[a]) * (p[b] - mean[b])).sum::<f64>();
+    let spread = (moment(0, 0) * moment(1, 1)).sqrt();
+    if spread > 0.0 { moment(0, 1) / spread } else { 0.0 }
 }
 
 /// Candidate factors of stored depths: powers of two and ten over this range.
@@ -309,6 +351,8 @@ pub(super) enum Unit<'a> {
     Right,
     /// Ratio of true to stated depths, the evidence, and a map's file.
     Wrong(f64, &'static str, &'a DepthFile),
+    /// They hold inverse depths: the correlation with the depths of points, and a map's file.
+    Inverse(f64, &'a DepthFile),
     /// Neither points nor other maps determine it.
     Unknown,
 }
@@ -317,7 +361,11 @@ pub(super) enum Unit<'a> {
 pub(super) fn depth_unit(capture: &Capture) -> Unit<'_> {
     let frames = with_depth(capture);
     let Some(file) = frames.first().and_then(|f| f.depth.as_ref()) else { return Unit::Right };
-    let by_points = by_points(capture).map(|ratio| (ratio, "initial points"));
+    let by_points = match by_points(capture) {
+        Some(ByPoints::Inverse(correlation)) => return Unit::Inverse(correlation, file),
+        Some(ByPoints::Ratio(ratio)) => Some((ratio, "initial points")),
+        None => None,
+    };
     match by_points.or_else(|| Some((by_views(capture)?, "depth maps of other views"))) {
         Some((ratio, by)) if ratio.max(1.0 / ratio) > SAME_UNIT => Unit::Wrong(ratio, by, file),
         Some(_) => Unit::Right,
@@ -334,14 +382,20 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 
 /// How much nearer colours of some points are to the images there than to those at other points.
 pub(super) fn gain_of(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    gain_if(capture, images, poses, Trial::AS_READ)
+    gain_if(capture, images, poses, Trial::AS_READ).map(|(gain, _)| gain)
 }
 
-/// The same with other intrinsics.
-pub(super) fn gain_if(capture: &Capture, images: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
+/// [`gain_of`] images with their poses as read.
+pub(super) fn gain_of_all(capture: &Capture, images: &[SmallImage]) -> Option<f64> {
+    let poses: Vec<Se3> = images.iter().map(|l| capture.frames[l.frame].source.cam_from_world).collect();
+    gain_of(capture, images, &poses)
+}
+
+/// The same with other intrinsics, and how many colours were compared.
+pub(super) fn gain_if(capture: &Capture, images: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
-    gain(capture, &chosen, images, poses, trial).map(|(gain, _)| gain)
+    gain(capture, &chosen, images, poses, trial)
 }
 
 /// How much nearer colours are to the image there than to that at other points, and how many were compared, with

@@ -1,5 +1,6 @@
 //! Poses in every convention, with and without points: named, and right ones not.
 
+use super::super::lens::Distortion;
 use super::super::tests::samples::Sample;
 use super::super::{CaptureKind, CaptureOptions, Convention, DepthFile, DepthKind};
 use super::*;
@@ -332,6 +333,16 @@ fn depth_maps_in_another_unit_are_named() {
     }
     let found = capture.check_points();
     assert!(found.len() == 1 && found[0].what.contains("initial points do not fit: these are 1.000e-3"), "{found:?}");
+    // Disparities grow where depths fall.
+    let write = |i: usize, of: &dyn Fn(f64) -> f64| {
+        let z = |x: u32, y: u32| shown(i, x, y).map_or(0.0, |(p, _)| of(pose(i).apply(p)[2]));
+        let map = ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| image::Luma([z(x, y).round() as u16]));
+        map.save(folder.path().join(format!("{i}.png"))).unwrap();
+    };
+    capture.train.iter().for_each(|&i| write(i, &|z| 9e3 / z));
+    let found = capture.check_points();
+    assert!(found.len() == 1 && found[0].what.contains("inverse depths") && found[0].remedy.contains("depth_kind"));
+    capture.train.iter().for_each(|&i| write(i, &|z| 1e3 * z));
     // Without points, maps of other views give the same result.
     let points = capture.points.take();
     let found = capture.check_points();
@@ -485,6 +496,8 @@ fn crops_stretched_images_and_foreign_distortion_are_named_by_points() {
     };
     assert_eq!(warned_of(&zoomed), [true, false, false]);
     assert_eq!(warned_of(&|c| c.intrinsics.fx *= 0.6), [false, true, false]);
+    // Between two factors that are tried.
+    assert_eq!(warned_of(&|c| c.intrinsics.fx /= 1.3), [false, true, false]);
     let k = [-0.5, 0.2, 0.0, 0.0, 0.0, 0.0];
     assert_eq!(warned_of(&|c| c.lens = Lens::Brown { k, p: [0.0; 2], s: [0.0; 4] }), [false, false, true]);
 }
@@ -515,6 +528,15 @@ fn black_turned_and_copied_images_are_named() {
             "{found:?}"
         );
     }
+    // A copy with the same pose is the same view: it must not be held out.
+    let mut capture = photos(true);
+    let first = capture.frames[capture.train[1]].clone();
+    capture.frames.push(Frame { image: at("copy.png"), ..first });
+    capture.held.push(capture.frames.len() - 1);
+    let found = warned(&capture);
+    assert!(found.iter().any(|w| w.contains("1 held-out images are copies of training images")), "{found:?}");
+    capture.train.push(capture.held.pop().unwrap());
+    assert!(!warned(&capture).iter().any(|w| w.contains("copies")));
     // A fixed camera may show the same again.
     let mut capture = photos(true);
     let first = capture.frames[0].clone();
@@ -557,6 +579,27 @@ fn inverted_masks_are_named_and_right_ones_are_not() {
 }
 
 #[test]
+fn a_camera_that_stopped_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = photos(false);
+    let frame = |(t, c): (usize, usize)| {
+        let image = folder.path().join(format!("{t}-{c}.png"));
+        let (from, frame) = (if c == 1 { 1 } else { (t + c) % 5 }, &capture.frames[c]);
+        std::fs::copy(&capture.frames[from].image, &image).unwrap();
+        Frame { index: t, time: splat4d::scene::Time(t as f64), image, ..frame.clone() }
+    };
+    let frames: Vec<Frame> = (0..4).flat_map(|t| (0..3).map(move |c| (t, c))).map(frame).collect();
+    capture.frames = frames;
+    capture.train = (0..capture.frames.len()).collect();
+    capture.held = Vec::new();
+    let said =
+        |c: &Capture| warned(c).into_iter().filter(|w| w.contains("same image all the time")).collect::<Vec<_>>();
+    assert!(said(&capture).len() == 1 && said(&capture)[0].ends_with(&format!("not: {}.", capture.cameras[1].name)));
+    capture.frames[10].image = capture.frames[9].image.clone();
+    assert_eq!(said(&capture), [""; 0]);
+}
+
+#[test]
 fn images_of_fixed_cameras_are_checked_once() {
     let mut capture = photos(false);
     let frame = |(t, c): (usize, usize)| Frame { index: t, ..capture.frames[c].clone() };
@@ -564,4 +607,74 @@ fn images_of_fixed_cameras_are_checked_once() {
     capture.train = (0..capture.frames.len()).collect();
     let cameras: Vec<usize> = capture.looked_at(3).iter().map(|&i| capture.frames[i].camera).collect();
     assert_eq!(cameras, [0, 1, 2]);
+}
+
+/// Images of an action camera whose poses and focal length are those of a pinhole.
+#[test]
+fn distorted_images_of_pinhole_cameras_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let lens = Distortion::new(Lens::Brown { k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] });
+    let mut capture = photos(true);
+    for (i, frame) in capture.frames.iter_mut().enumerate() {
+        let back = pose(i).inverse();
+        let color = |x: u32, y: u32| {
+            let at = [(f64::from(x) + 0.5 - 80.0) / FOCAL, (f64::from(y) + 0.5 - 60.0) / FOCAL];
+            let [x, y] = lens.undistort(at)?;
+            let (p, _) = hit(back.translation, sub(back.apply([x, y, 1.0]), back.translation))?;
+            Some(texture(p).map(|v| (v * 255.0).round() as u8))
+        };
+        frame.image = folder.path().join(format!("{i}.png"));
+        ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| Rgb(color(x, y).unwrap_or([90, 120, 200])))
+            .save(&frame.image)
+            .unwrap();
+    }
+    let found = warned(&capture);
+    assert!(found.iter().any(|w| w.contains("images are probably distorted") && w.contains("k1 = -0.3")), "{found:?}");
+}
+
+/// Points that walls hide have other colours than the images there; matches show that poses are right.
+#[test]
+fn hidden_points_raise_no_alarm_where_matches_fit() {
+    let shuffled = |keep: usize| {
+        let mut capture = photos(true);
+        let cloud = capture.points.as_mut().unwrap();
+        let count = cloud.colors.len();
+        let before = cloud.colors.clone();
+        for i in (0..count).filter(|i| i % 20 >= keep) {
+            cloud.colors[i] = before[(7 * i + 101) % count];
+        }
+        let seen = look::take(&capture, &capture.looked_at(CAMERAS), look::COARSE);
+        (points::gain_of_all(&capture, &seen).unwrap(), warned(&capture))
+    };
+    let (gain, found) = shuffled(6);
+    assert!((0.1..0.2).contains(&gain), "{gain}");
+    assert_eq!(found, [""; 0], "{gain}");
+    // Points of another scene.
+    let (gain, found) = shuffled(0);
+    assert!(gain < 0.1 && found.iter().any(|w| w.contains("Initial points and images do not fit")), "{gain} {found:?}");
+}
+
+/// Points next to the images that a shorter focal length brings into view, with colours that agree there by chance.
+#[test]
+fn too_few_points_in_view_do_not_decide_on_focal_lengths() {
+    let mut capture = photos(true);
+    let cloud = capture.points.as_mut().unwrap();
+    (cloud.points, cloud.colors) =
+        cloud.points.iter().zip(&cloud.colors).step_by(cloud.points.len() / 5).take(5).unzip();
+    for i in 0..CAMERAS {
+        for k in 0..12u32 {
+            // 0.3 units in front of one camera, no other has it in view.
+            let at = [f64::from(180 + 12 * (k % 3)), f64::from(20 + 25 * (k / 3))];
+            let ray = [(at[0] - 80.0) / FOCAL, (at[1] - 60.0) / FOCAL, 1.0];
+            let half = [0.5 * (at[0] - 80.0) + 80.0, 0.5 * (at[1] - 60.0) + 60.0];
+            let color = shown(i, half[0] as u32, half[1] as u32).map_or([0.35, 0.47, 0.78], |(p, _)| texture(p));
+            cloud.points.push(pose(i).inverse().apply(scale(ray, 0.3)));
+            cloud.colors.push(color);
+        }
+    }
+    cloud.times = Vec::new();
+    let seen = look::take(&capture, &capture.looked_at(CAMERAS), look::COARSE);
+    assert_eq!(points::gain_of_all(&capture, &seen), None, "too few are in the images as read");
+    let found = warned(&capture);
+    assert!(!found.iter().any(|w| w.contains("ocal length")), "{found:?}");
 }
