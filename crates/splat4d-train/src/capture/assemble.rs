@@ -350,6 +350,11 @@ fn skip_missing(take: &mut RawCapture, options: &CaptureOptions) -> Result<()> {
         )));
     }
     if missing.len() == all {
+        let broken = |p: &&Path| p.is_symlink() && !p.exists();
+        if let Some(link) = gone.and_then(|image| image.ancestors().find(broken)) {
+            let target = std::fs::read_link(link).unwrap_or_default();
+            what += &format!("; {} is a link to {}, which is not there", link.display(), target.display());
+        }
         return Err(Error::input(what).remedy("Put them there, or name the folder of the images with --images NAME."));
     }
     if share > options.max_missing {
@@ -490,9 +495,15 @@ fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool
             stated.0,
             stated.1
         );
-        // Reduced copies are meant to be smaller.
-        let meant =
-            resized.iter().all(|(image, ..)| image.ancestors().any(lookup::is_reduced)) || options.images.is_some();
+        // Reduced copies are meant to be smaller, and so are images that are all reduced alike: were they others, points and
+        // matches would not fit.
+        let ratio = size.0 as f64 / stated.0 as f64;
+        let alike = |own: (usize, usize), stated: (usize, usize)| {
+            [(own.0, stated.0), (own.1, stated.1)].iter().all(|&(n, of)| (n as f64 - ratio * of as f64).abs() <= 1.0)
+        };
+        let all_alike = resized.len() == upright.len() && resized.iter().all(|&(_, own, of)| alike(own, of));
+        let reduced = || resized.iter().all(|(image, ..)| image.ancestors().any(lookup::is_reduced));
+        let meant = all_alike || options.images.is_some() || reduced();
         take.account.add(Aspect::Assumed, if meant { Severity::Note } else { Severity::Warning }, what);
     }
     report_orientation(take, as_stored, by_size);

@@ -117,7 +117,8 @@ fn capture_folder(models: &Path) -> PathBuf {
         let of_models = MODEL_FOLDERS.iter().any(|n| name.eq_ignore_ascii_case(n)) || name.parse::<u32>().is_ok();
         if folder != models && !of_models {
             // A folder of results next to the images, such as `output/sparse/0`.
-            let above = folder.parent().filter(|p| !p.as_os_str().is_empty() && has_images(p));
+            // Loose images there may be anything.
+            let above = folder.parent().filter(|p| !p.as_os_str().is_empty() && has_image_folder(p));
             return above.map_or(folder.clone(), Path::to_path_buf);
         }
         folder = match folder.parent() {
@@ -130,8 +131,12 @@ fn capture_folder(models: &Path) -> PathBuf {
 
 /// Whether a folder has images where captures have them.
 pub(super) fn has_images(folder: &Path) -> bool {
-    let below = rig::file_names(folder).iter().any(|n| lookup::is_image_folder(n) && folder.join(n).is_dir());
-    below || !rig::image_names(folder).is_empty() || multiview::applies(folder)
+    has_image_folder(folder) || !rig::image_names(folder).is_empty() || multiview::applies(folder)
+}
+
+/// Whether a folder has one that is named after images.
+fn has_image_folder(folder: &Path) -> bool {
+    rig::file_names(folder).iter().any(|n| lookup::is_image_folder(n) && folder.join(n).is_dir())
 }
 
 /// The image of every shot, or where it should be.

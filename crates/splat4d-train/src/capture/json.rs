@@ -29,6 +29,8 @@ pub(super) fn read(path: &Path) -> Result<Value> {
     serde_json::from_str(&text).map_err(|e| {
         let remedy = if ["NaN", "Infinity"].iter().any(|word| text.contains(word)) {
             "It holds NaN or Infinity, which JSON does not allow: calibrate that camera again or leave it out."
+        } else if text.lines().any(|line| ["//", "/*", "#"].iter().any(|mark| line.trim_start().starts_with(mark))) {
+            "JSON has no comments: remove them (lines that begin with //, /* or #)."
         } else if e.is_eof() {
             "The file looks truncated: copy or export it again."
         } else {

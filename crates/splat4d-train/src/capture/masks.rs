@@ -164,6 +164,18 @@ fn report(
             first_names(&idle)
         );
         take.account.add(Aspect::NotRead, Severity::Warning, what);
+    } else if !idle.is_empty() && idle.len() == take.frames.iter().filter(|f| f.mask.is_none()).count() {
+        let bare: Vec<String> =
+            take.frames.iter().filter(|f| f.mask.is_none()).map(|f| below(&take.root, &f.image)).collect();
+        let what = format!(
+            "Masks probably have other numbers than their images: {} of {} images have none ({}), and as many files in {name}/ fit \
+             no image ({}). Where one counts from 0 and the other from 1, every mask is one frame off: rename them.",
+            bare.len(),
+            take.frames.len(),
+            first_names(&bare),
+            first_names(&idle)
+        );
+        take.account.add(Aspect::Assumed, Severity::Warning, what);
     } else if !idle.is_empty() {
         let what =
             format!("{} of {all} files in {name}/ fit no image of the capture: {}.", idle.len(), first_names(&idle));

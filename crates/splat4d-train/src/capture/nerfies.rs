@@ -132,6 +132,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let folders = [folder];
     let (mut frames, mut cameras) = (Vec::new(), Vec::<u64>::new());
     let mut left_out = 0;
+    let mut without_camera = Vec::new();
     for id in &ids {
         let split = match (for_train.contains(id), for_held.contains(id)) {
             (_, true) => Split::Held,
@@ -161,6 +162,10 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             cameras.len() - 1
         });
         let file = root.join("camera").join(format!("{id}.json"));
+        if !file.exists() {
+            without_camera.push(format!("{id}.json"));
+            continue;
+        }
         let value = json::read(&file)?;
         let source = camera_of(&Node::root(&value), &framing, options.poses);
         let source = source.map_err(|e| e.at(file.display()))?.downscaled(smaller);
@@ -168,6 +173,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         let time = index as f64 / fps;
         frames.push(RawFrame { split, ..RawFrame::new((camera, index, time), source, image) });
     }
+    skip_without_camera(&without_camera, ids.len(), root, options, &mut account)?;
     let last = frames.iter().map(|f| f.index).max().unwrap_or(0);
     let first = frames.iter().map(|f| f.index).min().unwrap_or(0);
     let length = (last - first) as f64 / fps;
@@ -198,6 +204,27 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         account,
         ..RawCapture::new(root, CaptureKind::Nerfies, Convention::NERFIES)
     })
+}
+
+/// Reports images whose camera file is missing, which are left out. Errors: too many are.
+fn skip_without_camera(
+    files: &[String],
+    all: usize,
+    root: &Path,
+    options: &CaptureOptions,
+    account: &mut Account,
+) -> Result<()> {
+    if files.is_empty() {
+        return Ok(());
+    }
+    let what = format!("{} of {all} camera files are missing: {}", files.len(), first_names(files));
+    if files.len() as f64 > options.max_missing * all as f64 {
+        return Err(Error::input(what)
+            .at(root.join("camera").display())
+            .remedy("Copy them too, or take their ids out of dataset.json."));
+    }
+    account.add(Aspect::NotFound, Severity::Warning, format!("{what}. Their images are left out."));
+    Ok(())
 }
 
 /// The finest folder of images, and by how much they are reduced. Errors: there is none.

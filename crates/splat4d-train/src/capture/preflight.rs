@@ -24,6 +24,9 @@ const FEW_CAMERAS: usize = 6;
 const NARROW_DEGREES: f64 = 20.0;
 /// Seconds from which f32 has steps of a millisecond.
 const FAR_CLOCK: f64 = 1e4;
+/// Images of a moving camera, at least, and how many times as long its path is in the order of times as in that of image names,
+/// from which times are in disorder.
+const PATH: (usize, f64) = (10, 3.0);
 /// Gaps between times may differ by this factor before the clock is called uneven.
 const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
@@ -137,7 +140,10 @@ impl Capture {
         if views.len() < FEW_CAMERAS {
             findings.push(finding(
                 Severity::Warning,
-                format!("Only {} cameras see the scene: extrapolated views are unreliable.", views.len()),
+                match views.len() {
+                    1 => "Only 1 camera sees the scene: extrapolated views are unreliable.".into(),
+                    n => format!("Only {n} cameras see the scene: extrapolated views are unreliable."),
+                },
                 "Judge the result near the recorded views, or add cameras (six or more all round the scene).",
             ));
         }
@@ -178,6 +184,7 @@ impl Capture {
             findings.push(finding(Severity::Warning, what, "Give times from the start of the clip."));
         }
         self.check_ranges(findings);
+        self.check_paths(findings);
         let gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
         let (low, high) = gaps.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &g| (l.min(g), h.max(g)));
         if !self.fixed_cameras() || gaps.len() < 2 || high <= UNEVEN * low {
@@ -188,6 +195,33 @@ impl Capture {
             format!("The times are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
             "Check frame numbers and time offsets; missing frames and unsynchronised cameras blur fast motion.",
         ));
+    }
+
+    /// Moving cameras that jump to and fro in the order of their times, and not in that of their image names.
+    fn check_paths(&self, findings: &mut Vec<Finding>) {
+        for (c, camera) in self.cameras.iter().enumerate().filter(|(_, camera)| !camera.fixed) {
+            let mut frames: Vec<&Frame> = self.frames.iter().filter(|f| f.camera == c).collect();
+            let length = |frames: &[&Frame]| -> f64 {
+                frames.windows(2).map(|w| norm(sub(w[0].source.center(), w[1].source.center()))).sum()
+            };
+            frames.sort_by(|a, b| a.time.0.total_cmp(&b.time.0).then(a.image.cmp(&b.image)));
+            let by_time = length(&frames);
+            let times = frames.windows(2).filter(|w| w[0].time != w[1].time).count() + 1;
+            frames.sort_by(|a, b| a.image.cmp(&b.image));
+            let by_name = length(&frames);
+            if times >= PATH.0 && by_name > 0.0 && by_time >= PATH.1 * by_name {
+                findings.push(finding(
+                    Severity::Warning,
+                    format!(
+                        "The times of camera {} are probably in disorder: in their order its path is {:.0} times as long as in \
+                         that of image names.",
+                        camera.name,
+                        by_time / by_name
+                    ),
+                    "Check which time belongs to which image.",
+                ));
+            }
+        }
     }
 
     /// Fixed cameras whose images are all before or after those of most others.

@@ -95,6 +95,17 @@ pub(super) fn order(
             names[0]
         ));
     }
+    // Folders that are named after cameras are believed.
+    let moving = || groups.iter().all(|group| !still(group, poses));
+    if sequence == Sequence::Auto && !moment && rig && !are_cameras(&naming.cameras) && moving() {
+        warnings.push(format!(
+            "The capture has no times: its {count} images are in the folders of {} cameras, numbered like frames ({} and so \
+             on), and read as the videos of moving cameras that record together at {fps} frames per second. If they were recorded \
+             one after another, or are photos of one time, use --set capture.sequence=photos.",
+            groups.len(),
+            names[0]
+        ));
+    }
     if moment && !one_each {
         return self::moment(names);
     }
@@ -299,6 +310,8 @@ mod tests {
         let rig = |name: &dyn Fn(usize, usize) -> String| numbered(12, |i| name(i / 4, i % 4));
         assert_eq!(timing(&rig(&|c, t| format!("cam{c}/{t:04}.png"))), (Timing::Numbers, 3, 0, 0));
         assert_eq!(timing(&rig(&|c, t| format!("side{c}/DSC{t}.png"))), (Timing::Moment, 12, 0, 1));
+        // Two walks, or two cameras that move.
+        assert_eq!(timing(&rig(&|c, t| format!("take{c}/{t:04}.png"))), (Timing::Numbers, 3, 1, 0));
         let one_each = numbered(5, |c| format!("cam{c}/IMG_{}.png", c + 20));
         assert_eq!(timing(&one_each), (Timing::Moment, 5, 0, 0));
         assert_eq!(timing(&["a/1.png".to_owned()]).0, Timing::Numbers, "one picture is one moment either way");

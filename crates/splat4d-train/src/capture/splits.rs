@@ -72,7 +72,7 @@ impl Lists {
         let keys: Vec<String> = names.iter().map(|n| key(n)).collect();
         let known: BTreeSet<&String> = keys.iter().collect();
         let mut split_of: BTreeMap<String, Split> = BTreeMap::new();
-        let mut lost = Vec::new();
+        let (mut lost, mut several) = (Vec::new(), BTreeSet::new());
         // Only a validation list: it is the only set to evaluate.
         let of_validation = if test.is_empty() { Split::Held } else { Split::Validation };
         for (names, split) in [(train, Split::Train), (validation, of_validation), (test, Split::Held)] {
@@ -80,7 +80,10 @@ impl Lists {
             for name in names {
                 match fitting(name, &known) {
                     Some(key) => {
-                        split_of.insert(key, split);
+                        let before = split_of.insert(key.clone(), split);
+                        if before.is_some_and(|b| b != split) {
+                            several.insert(key);
+                        }
                         found += 1;
                     }
                     None => lost.push(name),
@@ -95,6 +98,11 @@ impl Lists {
         if !lost.is_empty() {
             let what = format!("{} names of the split lists fit no frame: {}.", lost.len(), first_names(&lost));
             account.add(Aspect::NotFound, Severity::Warning, what);
+        }
+        if !several.is_empty() {
+            let what =
+                format!("{} of {} images are in several split lists, and not trained on.", several.len(), names.len());
+            account.add(Aspect::Assumed, Severity::Note, what);
         }
         let measured = !test.is_empty() || !validation.is_empty();
         let others = keys.iter().filter(|k| !split_of.contains_key(*k)).count();

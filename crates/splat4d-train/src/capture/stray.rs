@@ -42,13 +42,22 @@ const HEAD: u64 = 1 << 16;
 const HEADER_LINES: usize = 5;
 /// Folders that are looked into for a capture.
 const MOST_FOLDERS: usize = 100;
+/// The same in each of them.
+const MOST_INNER: usize = 10;
 
 /// Remedy for a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds nothing
 /// that is known.
 pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
-    if let Some(inner) = folders().find(|folder| is_capture(folder)) {
+    // Archives are often unpacked into a folder of their own name.
+    let deeper = || {
+        folders().flat_map(|folder| {
+            let names = rig::file_names(&folder);
+            names.into_iter().map(move |n| folder.join(n)).filter(|p| p.is_dir()).take(MOST_INNER)
+        })
+    };
+    if let Some(inner) = folders().find(|folder| is_capture(folder)).or_else(|| deeper().find(|f| is_capture(f))) {
         return Some(format!("A folder in it is a capture: give {}.", inner.display()));
     }
     if let Some(above) = above(root).filter(|folder| is_part(root) && is_capture(folder)) {
@@ -73,7 +82,7 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     if let Some(advice) = scenes(root, &names) {
         return Some(advice);
     }
-    if root.join(OUTPUT_CAMERAS).is_file() {
+    if root.join(OUTPUT_CAMERAS).is_file() && head(&root.join(OUTPUT_CAMERAS)).trim_start().starts_with('[') {
         return Some(format!(
             "{OUTPUT_CAMERAS} is that of a 3DGS output, which has no images: give the capture that it was trained on."
         ));

@@ -104,7 +104,7 @@ fn resized_images_scale_their_intrinsics_and_cropped_ones_are_refused() {
     let capture = open(&sample);
     let view = &capture.frames[3].view;
     assert_eq!((view.width, view.height, view.intrinsics.fx, view.intrinsics.cy), (WIDTH, HEIGHT, FOCAL, 8.0));
-    assert!(says(&capture.warnings, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
+    assert!(says(&capture.notes, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.notes);
     sample.edit("transforms.json", |v| v["h"] = json!(2 * HEIGHT + 6));
     assert_says(&refuse(&sample), &["cam00", "24x16", "48x38"]);
     // Any image is examined, not only the first.

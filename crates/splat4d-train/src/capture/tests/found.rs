@@ -415,3 +415,100 @@ fn images_of_one_name_and_two_endings_are_read_once() {
     image::RgbImage::new(6, 4).save(sample.path("cam01/images/0000.jpg")).unwrap();
     assert_has(&refuse(sample.root()), &["0000.jpg", "another size (6x4, here 24x16)", "Remove"]);
 }
+
+#[test]
+fn masks_of_other_numbers_than_their_images_are_warned_of() {
+    let sample = samples::photos(6, |c| format!("{c:04}.png"), None);
+    (0..6).for_each(|c| sample.mask(&format!("masks/{:04}.png", c + 1), |_, _| 255));
+    assert_warns(&open(&sample), &["1 of 6 images have none (images/0000.png)", "(0006.png)", "one frame off"]);
+    std::fs::remove_file(sample.path("masks/0006.png")).unwrap();
+    assert!(!open(&sample).warnings.iter().any(|w| w.contains("one frame off")));
+}
+
+#[test]
+fn images_that_are_all_reduced_alike_are_noted_and_others_warned_of() {
+    let sample = photos();
+    let larger = |v: &mut serde_json::Value, by: f64| {
+        for (key, value) in [("w", 24.0), ("h", 16.0), ("fl_x", 20.0), ("fl_y", 20.0), ("cx", 12.0), ("cy", 8.0)] {
+            v[key] = json!((by * value).round());
+        }
+    };
+    // Rounded: 16 is 51.8 divided by 3.24.
+    sample.edit("transforms.json", |v| larger(v, 3.24));
+    let capture = open(&sample);
+    assert_notes(&capture, &["6 images are of another size"]);
+    assert!(!capture.warnings.iter().any(|w| w.contains("another size")));
+    sample.edit("transforms.json", |v| larger(&mut v["frames"][2], 1.0));
+    assert_warns(&open(&sample), &["5 images are of another size"]);
+}
+
+#[test]
+fn comments_in_json_and_links_that_lead_nowhere_are_named() {
+    let sample = photos();
+    change(&sample, "transforms.json", |text| format!("// poses of the garden\n{text}"));
+    assert_has(&refuse(sample.root()), &["JSON has no comments"]);
+    #[cfg(unix)]
+    {
+        let sample = colmap();
+        std::fs::remove_dir_all(sample.path("images")).unwrap();
+        std::os::unix::fs::symlink("/nowhere/photos", sample.path("images")).unwrap();
+        assert_has(&refuse(sample.root()), &["6 of 6 images are missing", "is a link to /nowhere/photos"]);
+    }
+}
+
+#[test]
+fn images_whose_camera_file_is_missing_are_left_out() {
+    let sample = samples::nerfies();
+    std::fs::remove_file(sample.path("camera/000001.json")).unwrap();
+    assert_has(&refuse(sample.root()), &["1 of 4 camera files are missing: 000001.json", "dataset.json"]);
+    let options = CaptureOptions { max_missing: 0.3, ..CaptureOptions::default() };
+    let capture = Capture::open(sample.root(), &options).unwrap();
+    assert_warns(&capture, &["1 of 4 camera files", "left out"]);
+    assert_eq!(capture.frames.len(), 3);
+}
+
+#[test]
+fn times_that_contradict_the_path_of_a_camera_are_warned_of() {
+    let timed = |time: &dyn Fn(usize) -> usize| {
+        let sample = samples::photos(14, |c| format!("{c:04}.png"), None);
+        sample.edit("transforms.json", |v| {
+            for c in 0..14 {
+                // A straight walk.
+                let matrix = json!([[1, 0, 0, 0.1 * c as f64], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+                v["frames"][c]["transform_matrix"] = matrix;
+                v["frames"][c]["time"] = json!(0.1 * time(c) as f64);
+            }
+        });
+        open(&sample).preflight().into_iter().any(|f| f.what.contains("probably in disorder"))
+    };
+    assert!(timed(&|c| 5 * c % 14) && !timed(&|c| c) && !timed(&|c| 13 - c));
+}
+
+#[test]
+fn a_capture_two_folders_below_is_named() {
+    let sample = samples::photos(6, |c| format!("{c}.png"), None);
+    for name in ["images", "transforms.json"] {
+        rename(&sample, name, &format!("scene/scene/{name}"));
+    }
+    assert_has(&refuse(sample.root()), &["A folder in it is a capture", "scene/scene"]);
+    // The list of cameras of a calibration next to videos is no output of 3DGS.
+    let sample = Sample::new(&[]);
+    sample.write("cameras.json", br#"{"cameras": []}"#);
+    sample.write("videos/cam01.mp4", b"x");
+    assert_has(&refuse(sample.root()), &["It holds videos", "splat4d import"]);
+    sample.write("cameras.json", br#" [{"id": 0, "img_name": "a"}]"#);
+    assert_has(&refuse(sample.root()), &["3DGS output"]);
+}
+
+#[test]
+fn images_in_two_split_lists_are_counted() {
+    let sample = photos();
+    let names: Vec<String> = (0..6).map(|c| format!("images/IMG {c}.png")).collect();
+    sample.edit("transforms.json", |v| {
+        v["train_filenames"] = json!(names);
+        v["test_filenames"] = json!(names[..2]);
+    });
+    let capture = open(&sample);
+    assert_notes(&capture, &["2 of 6 images are in several split lists"]);
+    assert_eq!((capture.train.len(), capture.held.len()), (4, 2));
+}
