@@ -1,10 +1,10 @@
 //! Images that are copies of one another although their cameras differ: one was overwritten, or a name leads to the wrong
 //! file. Poses and points can be right then, and a few such images hardly show in what is measured over all.
 
-use super::super::Capture;
 use super::super::account::{Severity, first_names};
 use super::super::pose::same_pose;
 use super::super::preflight::Finding;
+use super::super::{Capture, Split};
 use super::Aspect;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -43,8 +43,11 @@ pub(super) fn check(capture: &Capture) -> Vec<Finding> {
     let frame = |i: usize| &capture.frames[i];
     let same = |a: usize, b: usize| same_pose(&frame(a).source, &frame(b).source);
     let differing = copies(&|a, b| !same(a, b));
-    let split = |i: usize| capture.split(i);
-    let leaking = copies(&|a, b| same(a, b) && frame(a).time == frame(b).time && split(a) != split(b));
+    // What one camera shows at one time is compared when the capture is opened.
+    let trains = |i: usize| capture.split(i) == Split::Train;
+    let leaking = copies(&|a, b| {
+        same(a, b) && frame(a).time == frame(b).time && frame(a).camera != frame(b).camera && trains(a) != trains(b)
+    });
     let warning = |what: String, remedy: &str| Finding {
         severity: Severity::Warning,
         aspect: Some(Aspect::Assumed),

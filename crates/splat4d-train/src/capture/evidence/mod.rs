@@ -76,9 +76,10 @@ impl Capture {
         if !check.misread {
             let poses: Vec<Se3> = images.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
             check.more.extend(focal::check(self, matches.as_deref(), &images, &poses));
+            let fits = check.more.iter().chain([&check.finding]).all(|f| f.severity == Severity::Note);
             check.more.extend(check_masks(&images, &poses));
             check.more.extend(copies::check(self));
-            if order.len() > outliers::ALL && check.finding.severity == Severity::Note {
+            if order.len() > outliers::ALL && fits {
                 let seen: Vec<usize> = images.iter().map(|l| l.frame).collect();
                 check.more.extend(parts::check(self, &order, &seen));
             }

@@ -198,8 +198,27 @@ fn strange(
     let middle = gains.get(gains.len() / 2)?.0;
     let low: Vec<(f64, usize)> = gains.iter().copied().take_while(|(g, _)| *g < STRANGE.0).collect();
     let few = low.len() as f64 <= (FEW * gains.len() as f64).max(1.0);
-    let (best, _) = *low.last().filter(|_| few && middle >= STRANGE.1)?;
-    Some(Strange { frames: low.iter().map(|(_, f)| *f).collect(), gains: [best, middle] })
+    if !few || middle < STRANGE.1 {
+        return None;
+    }
+    let strange: Vec<(f64, usize)> = low.into_iter().filter(|(_, f)| !matched(capture, order, *f)).collect();
+    let (best, _) = *strange.last()?;
+    Some(Strange { frames: strange.iter().map(|(_, f)| *f).collect(), gains: [best, middle] })
+}
+
+/// Whether matches with the images around it show that an image has the right pose: points may be hidden from it.
+fn matched(capture: &Capture, order: &[usize], frame: usize) -> bool {
+    let Some(k) = order.iter().position(|&f| f == frame) else { return false };
+    let around = &order[k.saturating_sub(BESIDE)..(k + BESIDE + 1).min(order.len())];
+    let mut images = look::take(capture, around, look::COARSE);
+    look::describe(&mut images, look::COARSE);
+    let Some(own) = images.iter().position(|l| l.frame == frame) else { return false };
+    let poses: Vec<Se3> = images.iter().map(|l| capture.frames[l.frame].source.cam_from_world).collect();
+    (0..images.len()).filter(|&other| other != own).any(|other| {
+        let matches = pairs::between([own, other], &images[own].marks, &images[other].marks, pairs::STRICT);
+        let fitting = pairs::fitting(&matches, &images, &poses);
+        matches.len() >= OVERLAP && fitting as f64 >= FITS[0] * matches.len() as f64
+    })
 }
 
 /// Matches of two images.
