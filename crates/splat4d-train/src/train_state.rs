@@ -10,7 +10,8 @@ mod exposure;
 pub(crate) use corrections::Scale;
 pub use corrections::{Corrections, RefineSettings};
 pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
-pub(crate) use exposure::Exposure;
+pub use exposure::COLUMNS as EXPOSURE_COLUMNS;
+pub(crate) use exposure::{Exposure, expose};
 
 use crate::Result;
 use crate::optim::Moments;

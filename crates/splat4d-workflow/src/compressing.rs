@@ -22,7 +22,8 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{TrainOptions, checkpoint};
+use splat4d_train::run::{TrainOptions, checkpoint, corrected};
+use splat4d_train::train_state::EXPOSURE_COLUMNS;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -326,7 +327,8 @@ impl Work {
         })?;
         console.phase("reading the capture", 0, 0);
         let (capture, recipe) = run.open_capture()?;
-        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture) };
+        let exposures = corrected::exposures(&capture, &run.path)?;
+        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), exposures };
         let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
@@ -561,18 +563,30 @@ struct Original<'a> {
     scene: &'a Scene<f32>,
     capture: Arc<Capture>,
     recipe: Recipe,
+    /// What its cameras do to colours, frame by frame.
+    exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
 }
 
 impl Original<'_> {
     fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
-        Job { source: self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings }
+        Job {
+            source: self.scene,
+            capture: self.capture.clone(),
+            recipe: &self.recipe,
+            settings,
+            exposures: &self.exposures,
+        }
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
     fn scores(&self, scene: &Scene<f32>, stop: &AtomicBool, console: &dyn Listener) -> Result<Scores> {
         let store = Arc::new(ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize));
-        let options =
-            EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
+        let options = EvalOptions {
+            antialias: self.recipe.appearance.antialias,
+            pictures: false,
+            exposures: self.exposures.clone(),
+            ..EvalOptions::default()
+        };
         let scores = assess(scene, &self.capture, &store, 0, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         Ok(scores)

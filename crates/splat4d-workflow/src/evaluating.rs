@@ -419,6 +419,7 @@ impl Measuring<'_> {
             measured,
             place,
             align: Align::of(capture, self.recipe),
+            exposures: corrected::exposures(capture, &self.opened.path)?,
             device: self.measure.device,
             ..EvalOptions::default()
         };

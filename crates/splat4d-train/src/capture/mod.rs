@@ -427,6 +427,11 @@ impl Capture {
         }
     }
 
+    /// Whether it consists of photos of a moment, whose cameras have no names: each photo is its own camera.
+    pub(crate) fn of_photos(&self) -> bool {
+        self.timing == Timing::Moment && !self.named
+    }
+
     /// The views of the training cameras: one of every fixed camera, all of moving ones.
     pub(crate) fn places(&self) -> impl Iterator<Item = &Camera> {
         let mut seen = vec![false; self.cameras.len()];

@@ -28,6 +28,7 @@ use crate::recipe::Recipe;
 use crate::run::{Outcome, TrainOptions};
 use crate::run::{Refine, refine};
 use crate::run::{plan, training_frames};
+use crate::train_state::{EXPOSURE_COLUMNS, Exposure};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages, feature_ranges};
@@ -53,6 +54,8 @@ pub struct Job<'a> {
     pub recipe: &'a Recipe,
     /// The settings of compression.
     pub settings: &'a Compression,
+    /// What the cameras of the capture's frames do to colours, as the scene's run learnt it ([`crate::run::corrected::exposures`]); empty: nothing.
+    pub exposures: &'a [[f32; EXPOSURE_COLUMNS]],
 }
 
 /// The result of a compression.
@@ -92,7 +95,7 @@ pub fn compress(
             stages,
             frames: training_frames(job.capture.clone(), job.recipe)?,
             recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
-            exposure: None,
+            exposure: (!job.exposures.is_empty()).then(|| Exposure::learnt(&job.capture, job.exposures)),
             identity: job.settings.to_toml(),
             budget: None,
         },
