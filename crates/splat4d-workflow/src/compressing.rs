@@ -1,4 +1,5 @@
-//! The work behind `compress`: rounds until size and guard are content, the file, scores, comparison and report.
+//! The work behind `compress`: rounds until size limit and quality guard are met, the file, scores, comparison and
+//! report.
 
 use crate::baking;
 use crate::draw::antialias;
@@ -92,7 +93,7 @@ pub struct CompressOptions {
     pub size: [usize; 2],
     /// Device that renders during fine-tuning; the CPU does the rest.
     pub device: Device,
-    /// How held-out views are measured.
+    /// Options of the evaluation.
     pub measure: Measure,
 }
 
@@ -344,9 +345,9 @@ impl Work {
             }
         };
         if let (Some(before), Some(after)) = (before, after) {
-            let told = self.compare(&source, &original, [&before, &after], stop, recorded)?;
-            print_summary(&told, self.size, console);
-            let text = serde_json::to_string_pretty(&told).expect("results are plain data");
+            let compared = self.compare(&source, &original, [&before, &after], stop, recorded)?;
+            print_summary(&compared, self.size, console);
+            let text = serde_json::to_string_pretty(&compared).expect("results are plain data");
             files::write(&self.dir.join(COMPRESS), text.as_bytes())?;
             evaluating::amend(&self.dir, [("notes".into(), json!(recorded.warnings()))])?;
             console.written(&report::write(&Run::open(&self.dir)?)?);
@@ -389,7 +390,8 @@ impl Work {
         subjects.extend(unpruned.iter().map(|(scene, _)| What::Scene(scene)));
         let subjects: Vec<Subject<'_>> = subjects.into_iter().map(|what| Subject { what, antialias: smooth }).collect();
         let measured_views = measured_views_of(source, self.size)?;
-        let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total))?;
+        let sides =
+            in_turns(&subjects, &measured_views, &mut |done, total| console.phase("timing playback", done, total))?;
         console.clear();
         let mut sides = sides.into_iter();
         let mut next = || sides.next().expect("a side for every subject");
@@ -623,9 +625,9 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
-    let fair = told.fair();
-    let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
+fn print_summary(compared: &Compressed, size: [usize; 2], console: &dyn Listener) {
+    let fair = compared.fair();
+    let name = if compared.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(
@@ -643,13 +645,16 @@ fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
         )
     };
     console.result(&line(name, fair));
-    console.result(&line("after", &told.after));
-    if let Some(times) = told.smaller() {
-        let faster = told.after.fps / fair.fps;
+    console.result(&line("after", &compared.after));
+    if let Some(times) = compared.smaller() {
+        let faster = compared.after.fps / fair.fps;
         // The alternative comes first: the plain file, and not the floats of the run.
-        let plain = told.plain.as_ref().filter(|plain| plain.bytes > 0);
+        let plain = compared.plain.as_ref().filter(|plain| plain.bytes > 0);
         let plain = plain.map_or_else(String::new, |plain| {
-            format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
+            format!(
+                "{:.1} times smaller than the plain playback file, ",
+                plain.bytes as f64 / compared.after.bytes as f64
+            )
         });
         // Floats are never shipped: their figure is used only without a plain file.
         let smaller = match plain.is_empty() {

@@ -195,7 +195,7 @@ pub enum Split {
     Future,
 }
 
-/// How much there is of a capture.
+/// Size of a capture.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Extent {
     /// The first frame number, and the one after the last.

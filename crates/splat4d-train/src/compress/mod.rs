@@ -1,5 +1,5 @@
-//! Compression: a trained scene loses its least important Gaussians, becomes a playback file, and is fine-tuned as that
-//! file.
+//! Compression: removes the least important Gaussians of a trained scene, writes it as a playback file, and fine-tunes
+//! it through that file's quantisation.
 //!
 //! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et
 //!    al. 2025).
@@ -50,7 +50,7 @@ pub struct Job<'a> {
     pub source: &'a Scene<f32>,
     /// The capture it was trained on.
     pub capture: Arc<Capture>,
-    /// How it was trained.
+    /// Record of its training.
     pub recipe: &'a Recipe,
     /// The settings of compression.
     pub settings: &'a Compression,
@@ -61,7 +61,7 @@ pub struct Job<'a> {
 /// The result of a compression.
 #[derive(Debug)]
 pub struct Compressed {
-    /// How the run ended.
+    /// End of the run.
     pub outcome: Outcome,
     /// The file to write, once the last step is done; none where the settings have no codec.
     pub pages: Option<Pages>,

@@ -359,9 +359,10 @@ impl<'a> Judge<'a> {
         split: &mut Split,
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Value> {
-        let mut told = |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
+        let mut progress =
+            |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
         let (scene, store, backend) = (self.scene, self.store, self.backend.as_mut());
-        let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut told)?;
+        let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut progress)?;
         for camera in cameras(&capture, frames) {
             let fixed = capture.cameras[camera.id].fixed && camera.places.len() > 1;
             let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };

@@ -28,11 +28,11 @@ settings! {
 settings! {
     /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
-        /// Rate of positions at the start, of the extent; 0: 0.001, and less in proportion if `densify.max_cap` is above
-        /// 60,000.
+        /// Rate of positions at the start, share of the extent; 0: 0.001, and less in proportion if `densify.max_cap`
+        /// is above 60,000.
         position_init: f64 = 0.0 => any().unit("extents");
-        /// Rate of positions at the end, of the extent; 0: 0.0001, and less in proportion if `densify.max_cap` is above
-        /// 30,000.
+        /// Rate of positions at the end, share of the extent; 0: 0.0001, and less in proportion if `densify.max_cap` is
+        /// above 30,000.
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();

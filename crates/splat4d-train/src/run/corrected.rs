@@ -1,4 +1,4 @@
-//! `refined.json`: what a run has learnt of its capture's cameras, so that measurements of the scene use them.
+//! `refined.json`: corrections of the capture's cameras that a run has learnt. Measurements of the scene apply them.
 
 use super::checkpoint::write_atomically;
 use crate::capture::{Capture, Frame};

@@ -1,4 +1,4 @@
-//! [`Exposure`]: what learns of the cameras.
+//! [`Exposure`]: learnt colour matrices of the cameras.
 
 use crate::capture::Capture;
 use crate::optim::Moments;
