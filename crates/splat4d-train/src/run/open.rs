@@ -304,9 +304,7 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // Cameras of a rig have colours of their own, and one image of each shows them. Photos of one camera differ
-        // where it
-        // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
+        // Cameras of a rig differ in colour, and one image of each shows it. Photos of one camera differ in exposure.
         let pictures = if self.capture.named || c.appearance.exposure_single { 1 } else { 2 };
         let trained: Vec<usize> =
             trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();
