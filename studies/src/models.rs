@@ -159,14 +159,14 @@ fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
 fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicBool) -> anyhow::Result<Option<String>> {
     let own = std::env::current_exe().context("this program does not know where it lies")?;
     let log = args.output.join(format!("{}.log", folder.file_name().unwrap_or_default().to_string_lossy()));
-    let told = std::fs::File::create(&log).map_err(|e| files::cannot_write(&log, e))?;
+    let output = std::fs::File::create(&log).map_err(|e| files::cannot_write(&log, e))?;
     let mut command = Command::new(own);
     command.arg("train").arg(capture).args(["--motion", model, "--minutes", &args.minutes.to_string()]);
     command.args(["--downscale", &args.downscale.to_string(), "--force", "-o"]).arg(folder);
     for setting in &args.set {
         command.args(["--set", setting]);
     }
-    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(told).spawn()?;
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(output).spawn()?;
     let begun = Instant::now();
     let status = loop {
         if let Some(status) = child.try_wait()? {

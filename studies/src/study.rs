@@ -186,8 +186,8 @@ mod tests {
         let file = folder.path().join("e03.json");
         for text in ["", "[]", "{\"runs\": []}", "{\"version\": 9, \"runs\": []}"] {
             std::fs::write(&file, text).unwrap();
-            let told = Study::open(&file).unwrap_err().to_string();
-            assert!(told.contains("e03.json") && told.contains("-o"), "{told}");
+            let message = Study::open(&file).unwrap_err().to_string();
+            assert!(message.contains("e03.json") && message.contains("-o"), "{message}");
         }
     }
 }

@@ -17,7 +17,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-/// How much is reported.
+/// Verbosity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Loudness {
     /// Warnings and errors only.
@@ -466,10 +466,10 @@ mod tests {
         let console = Console::keeping_objects();
         (0..=100).for_each(|done| console.phase("baking", done, 100));
         console.phase("writing", 0, 0);
-        let told = console.into_objects();
-        assert!((3..=5).contains(&told.len()), "{told:?}");
-        assert_eq!(told[0], json!({"type": "phase", "name": "baking", "done": 0, "total": 100}));
-        assert!(told.iter().any(|o| o["done"] == 100) && told.last().unwrap()["name"] == "writing");
+        let objects = console.into_objects();
+        assert!((3..=5).contains(&objects.len()), "{objects:?}");
+        assert_eq!(objects[0], json!({"type": "phase", "name": "baking", "done": 0, "total": 100}));
+        assert!(objects.iter().any(|o| o["done"] == 100) && objects.last().unwrap()["name"] == "writing");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Ctrl-C: the first requests a stop (training saves a checkpoint), the second ends the program at once.
 //!
-//! Work that does not poll for the stop (`ends`) is ended after a moment: all files are written under temporary names,
-//! and locks of dead processes are taken over, so that the same command continues.
+//! Work that does not poll for the stop (`ends`) is ended after a short wait. This is safe: all files are written under
+//! temporary names, and locks of dead processes are taken over, so the same command continues.
 
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};

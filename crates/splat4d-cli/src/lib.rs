@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn other_programs_get_errors_without_usage() {
-        let told = |words: &[&str]| {
+        let output = |words: &[&str]| {
             let words: Vec<OsString> = words.iter().map(OsString::from).collect();
             call(&words).unwrap_err().to_string()
         };
@@ -288,11 +288,11 @@ mod tests {
             (&["fly"], "fly"),
             (&["bake", "x"], "required"),
         ] {
-            let text = told(words);
+            let text = output(words);
             let plain = !text.contains("Usage") && !text.contains("--help") && !text.contains('\n');
             assert!(text.contains(what) && plain && !text.starts_with("error"), "{text}");
         }
-        assert!(told(&["bake", "--help"]).contains("Usage"));
+        assert!(output(&["bake", "--help"]).contains("Usage"));
     }
 
     #[test]

@@ -13,7 +13,7 @@ pub(crate) struct MeasureArgs {
 }
 
 impl MeasureArgs {
-    /// How views are measured.
+    /// Options of the evaluation.
     pub(crate) fn options(&self) -> Measure {
         Measure { lpips_weights: self.lpips_weights.clone(), ..Measure::default() }
     }

@@ -91,12 +91,12 @@ fn machine() -> String {
 
 /// Opens the user's browser; false where there is no screen, or nothing that opens pages.
 fn open_browser(url: &str) -> bool {
-    let told = |name: &str| std::env::var_os(name).is_some_and(|v| !v.is_empty());
+    let is_set = |name: &str| std::env::var_os(name).is_some_and(|v| !v.is_empty());
     let mut command = if cfg!(target_os = "macos") {
         Command::new("open")
     } else if cfg!(windows) {
         Command::new("explorer")
-    } else if told("DISPLAY") || told("WAYLAND_DISPLAY") {
+    } else if is_set("DISPLAY") || is_set("WAYLAND_DISPLAY") {
         Command::new("xdg-open")
     } else {
         return false;
@@ -166,7 +166,7 @@ impl Control {
             _ => return Err(Error::input("unknown request of the page").remedy("Reload the page")),
         };
         self.paused.store(state == "pausing", Ordering::SeqCst);
-        Ok(EditResponse { told: json!({ "state": state }), scene: None })
+        Ok(EditResponse { result: json!({ "state": state }), scene: None })
     }
 }
 
@@ -293,7 +293,7 @@ mod tests {
     fn a_paused_run_stops_its_clock_and_can_continue_or_stop() {
         let stop = Arc::new(AtomicBool::new(false));
         let control = Control::new(stop.clone());
-        let ask = |what: &str| control.answer(&json!({ "do": what })).map(|a| a.told["state"].clone());
+        let ask = |what: &str| control.answer(&json!({ "do": what })).map(|a| a.result["state"].clone());
         assert!(ask("explode").is_err() && !control.is_paused());
         for way in ["continue", "stop"] {
             assert_eq!(ask("pause").unwrap(), "pausing");

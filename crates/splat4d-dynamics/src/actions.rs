@@ -1,4 +1,4 @@
-//! Actions: what is done to a scene, a row of named numbers per frame.
+//! Actions: external inputs to a scene, a row of named numbers per frame.
 //!
 //! Columns `NAME.x`, `NAME.y`, `NAME.z` that follow each other are one vector in the world, which turns with it; other
 //! columns are scalars. Row t acts between frame t and the next.

@@ -1,4 +1,4 @@
-//! The baselines that learn nothing: freeze, constant velocity and turn, damped acceleration.
+//! Baselines without learning: freeze, constant velocity and turn, damped acceleration.
 
 use crate::paths::{Moment, Paths, Pose, exp, turn};
 use splat4d::math::quat;
@@ -22,7 +22,7 @@ pub(crate) fn ballistic(paths: &Paths, horizon: usize, damping: Option<f64>) -> 
     (1..=horizon).map(step).collect()
 }
 
-/// How a node moves at the last time, a frame.
+/// Motion of a node at the last time, per frame.
 struct Rates {
     velocity: [f64; 3],
     acceleration: [f64; 3],

@@ -1,5 +1,5 @@
-//! The predicted scene: up to the last observed time the learnt scene, after it dynamic regions are moved by the nodes,
-//! with the appearance of that time, in the static background.
+//! The predicted scene. Up to the last observed time it is the trained scene. After it, nodes move the dynamic regions,
+//! with the appearance of that time, in front of the static background.
 
 use crate::nodes::Observed;
 use crate::paths::{Moment, Paths};

@@ -140,7 +140,7 @@ impl Projection {
         Self { a, gram }
     }
 
-    /// How much of each column there is in each of y's.
+    /// Coefficients of each column for each column of y.
     fn amounts(&self, y: &DMatrix<f64>) -> DMatrix<f64> {
         self.gram.solve(&(self.a.transpose() * y))
     }

@@ -55,7 +55,7 @@ pub trait Network: Clone {
     fn warm_up(&self) -> usize {
         0
     }
-    /// Numbers that it remembers of a row.
+    /// State that it keeps for a row.
     fn memory(&self) -> usize {
         0
     }

@@ -1,4 +1,4 @@
-//! The ladder: every model that continues from observed paths, by name, each a baseline for the next.
+//! All models that continue observed paths, by name, each a baseline for the next.
 
 use crate::actions::Actions;
 use crate::ballistic::{DAMPING, ballistic, freeze};

@@ -1,8 +1,8 @@
-//! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
+//! Nodes with identity on the dynamic regions of a scene with any motion model.
 //!
 //! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
-//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), others around the
-//! node take over at the tick before, so that the node continues although no Gaussian does.
+//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), other Gaussians
+//! around the node replace them at the tick before, so the node lasts longer than any Gaussian.
 
 use crate::learnt::LEAST_TICKS;
 use crate::paths::{Moment, Paths, Pose};
@@ -244,16 +244,16 @@ fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec
         let way = norm(sub(bounds[i][1].map(f64::from), bounds[i][0].map(f64::from)));
         seen[i] >= SEEN && way > SPEED * size * tick * f64::from(seen[i] - 1)
     };
-    let told: Vec<bool> = (0..n).map(fast).collect();
-    let mut moves = told.clone();
+    let own: Vec<bool> = (0..n).map(fast).collect();
+    let mut moves = own.clone();
     let alive: Vec<usize> = (0..n).filter(|&i| last.alpha[i] >= OPAQUE).collect();
     let points: Vec<[f32; 3]> = alive.iter().map(|&i| last.x[i]).collect();
     let near = knn(&points, VOTERS);
     for (a, &i) in alive.iter().enumerate() {
-        let votes = near[a * VOTERS..(a + 1) * VOTERS].iter().filter(|&&b| told[alive[b as usize]]).count();
+        let votes = near[a * VOTERS..(a + 1) * VOTERS].iter().filter(|&&b| own[alive[b as usize]]).count();
         moves[i] = 2 * votes > VOTERS;
     }
-    (told, moves)
+    (own, moves)
 }
 
 /// Points without those that float alone.

@@ -1,4 +1,4 @@
-//! One way to train the networks of this crate: Adam under a cosine, gradients clipped, weights decayed.
+//! Training of this crate's networks: Adam with a cosine schedule, gradient clipping and weight decay.
 
 use splat4d::math::Real;
 use splat4d::scene::{Grads, Key, LifeKind, Params};

@@ -60,7 +60,7 @@ pub fn ensemble(members: &[Vec<Moment>]) -> (Vec<Moment>, Vec<Vec<f64>>) {
     (mean, spread)
 }
 
-/// How an ensemble's spread fits its errors.
+/// Calibration of an ensemble: its spread against its errors.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Calibration {
     /// Root mean square of the error over that of the spread: 1 is right, above 1 is overconfident.

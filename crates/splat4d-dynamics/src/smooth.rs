@@ -3,7 +3,7 @@
 //!
 //! z = argmin ‖y − z‖² + λ‖D³z‖² (Whittaker 1923, Eilers 2003), whose ends stay free: parabolas pass unchanged, so that
 //! the velocity at the last observed time is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978)
-//! over all nodes together. No tick after the last observed one exists here.
+//! over all nodes together. Ticks after the last observed one are not read.
 
 use crate::paths::{Moment, Paths};
 use nalgebra::DMatrix;

@@ -82,7 +82,7 @@ impl Gaussians {
         time: f64,
     ) -> PyResult<Self> {
         if !time.is_finite() {
-            return Err(bad_input(format!("the time is {time}"), "Give seconds"));
+            return Err(bad_input(format!("invalid time {time}"), "Give seconds"));
         }
         let shapes = Shapes::new(means, quats, scales, opacities, sh, colors, false)?;
         let count = shapes.means.rows;

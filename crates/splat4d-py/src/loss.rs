@@ -30,14 +30,14 @@ impl Raised {
     }
 }
 
-/// The view of a loss.
+/// The view that a loss function compares.
 #[pyclass(frozen, get_all, module = "splat4d")]
 pub(crate) struct View {
     /// Second of the scene.
     time: f64,
-    /// Place of the image among those trained on.
+    /// Index of the image among the training images.
     frame: usize,
-    /// Place of its camera in the capture.
+    /// Index of its camera in the capture.
     camera: usize,
     /// Steps taken before this one.
     iteration: usize,

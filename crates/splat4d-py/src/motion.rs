@@ -1,6 +1,6 @@
-//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes it the
-//! gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
-//! checkpoints and scenes hold them.
+//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes their
+//! gradient to the model. The library manages the model's tables: density control copies and removes rows, Adam updates
+//! them, checkpoints and scenes store them.
 
 use crate::arrays::{numbers, rows, shaped};
 use crate::errors::{OrRaise, bad_input};
@@ -74,7 +74,7 @@ impl Hook {
             let (table, width): (String, usize) = (table.extract()?, width.extract()?);
             if width == 0 {
                 return Err(bad_input(
-                    format!("`{table}` has 0 numbers a Gaussian"),
+                    format!("`{table}` has 0 numbers per Gaussian"),
                     "Give 1 or more, or leave it out",
                 ));
             }

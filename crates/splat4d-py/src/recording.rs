@@ -18,7 +18,7 @@ use splat4d_workflow::inspecting::{self, InspectOptions};
 use std::path::PathBuf;
 
 /// Makes a capture in the folder `out` from videos, folders of videos, or folders of images, one per camera: frames,
-/// synchronization, poses, lenses and points (docs/own-videos.md). Returns the capture; its folder has `import.toml`, in which
+/// synchronisation, poses, lenses and points (docs/own-videos.md). Returns the capture; its folder has `import.toml`, in which
 /// results can be corrected before the same call is repeated.
 ///
 /// `rig`: "fixed", "moving" or "auto". `every` keeps each n-th frame; `start` and `end` are seconds of the first camera's video;

@@ -63,7 +63,7 @@ impl Run {
         plain(py, &results.unwrap_or(Value::Null))
     }
 
-    /// How far the run is and who works on it, as `splat4d status --json` prints it.
+    /// Progress and workers of the run, as `splat4d status --json` prints them.
     fn status(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let status = py.detach(|| status::of(&self.path)).or_raise()?;
         plain(py, &serde_json::to_value(&status).expect("it is plain data"))

@@ -126,7 +126,7 @@ impl Scene {
 
 /// Errors: not a number.
 fn time(t: f64) -> PyResult<Time> {
-    if t.is_finite() { Ok(Time(t)) } else { Err(bad_input(format!("the time is {t}"), "Give seconds of the scene")) }
+    if t.is_finite() { Ok(Time(t)) } else { Err(bad_input(format!("invalid time {t}"), "Give seconds of the scene")) }
 }
 
 #[pymethods]
@@ -170,8 +170,7 @@ impl Scene {
         Ok(Self::made(about.scene(vec![layer], seen)?, Vec::new()))
     }
 
-    /// A scene of frames that have nothing to do with each other, each a `Gaussians`: frame k is seen around k/fps
-    /// seconds.
+    /// A scene of independent frames, each a `Gaussians`: frame k is visible around k/fps seconds.
     #[staticmethod]
     #[pyo3(signature = (frames, *, fps=30.0, up=None, background=None))]
     fn from_frames(
@@ -191,7 +190,7 @@ impl Scene {
 
     /// All learnable arrays of the scene by their names in `scene.safetensors`: `layers.0.means` [N, 3],
     /// `layers.0.log_scales` [N, 3], `layers.0.opacity_logits` [N], `layers.0.sh` [N, K, 3], … and those of its motion
-    /// model. Copies. Not of a playback file, which has none.
+    /// model. The arrays are copies. Playback files have none: an error.
     fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         rendering::parameters(py, learnable(self)?)
     }

@@ -1,5 +1,5 @@
 //! Arrays become Gaussians and scenes: static ones, paths with a pose per time, polynomials in time with lifespans, and
-//! frames whose Gaussians have nothing to do with each other.
+//! frames without common Gaussians.
 
 use crate::arrays::{finite, numbers};
 use crate::errors::{OrRaise, bad_input};
@@ -117,7 +117,7 @@ impl Shapes {
                 let coefficients = sh.width / 3;
                 if !(1..=MAX_COEFFS).any(|k| k == coefficients && [1, 4, 9, 16].contains(&k)) {
                     return Err(bad_input(
-                        format!("sh has {coefficients} coefficients a Gaussian"),
+                        format!("sh has {coefficients} coefficients per Gaussian"),
                         "Give 1, 4, 9 or 16 (degrees 0 to 3)",
                     ));
                 }
@@ -252,7 +252,7 @@ fn spacetime(shapes: &Shapes, moving: &Moving<'_, '_>, polynomial: bool) -> PyRe
     let order = velocities.as_ref().map_or(0, |v| v.width / 3);
     if order > MAX_ORDER {
         return Err(bad_input(
-            format!("velocities have {order} orders a Gaussian"),
+            format!("velocities have {order} orders per Gaussian"),
             "Give at most 3: velocity, and the coefficients of the second and third power of time",
         ));
     }
@@ -315,7 +315,7 @@ impl About<'_, '_> {
     pub(crate) fn scene(&self, layers: Vec<Layer<f32>>, clip: [f64; 2]) -> PyResult<Scene<f32>> {
         let clip = self.clip.unwrap_or(clip);
         if !(clip[0] <= clip[1] && clip.iter().all(|t| t.is_finite())) {
-            return Err(bad_input(format!("the clip is {clip:?}"), "Give its first and last second"));
+            return Err(bad_input(format!("invalid clip {clip:?}"), "Give its first and last second"));
         }
         let up = match self.up {
             Some(up) => finite::<3>(up, "up")?,

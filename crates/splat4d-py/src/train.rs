@@ -126,7 +126,7 @@ pub(crate) fn resume(
 struct Listener {
     progress: Option<Py<PyAny>>,
     /// Whether the caller's function gets warnings; otherwise they are Python warnings.
-    told: bool,
+    listened: bool,
     loss: Option<Py<PyAny>>,
     raised: Arc<Raised>,
 }
@@ -140,12 +140,12 @@ impl Listener {
         raised: Arc<Raised>,
     ) -> PyResult<Self> {
         let silent = progress.as_ref().is_some_and(|p| p.bind(py).is(&*PyBool::new(py, false)));
-        let (told, progress) = match progress {
+        let (listened, progress) = match progress {
             Some(_) if silent => (false, None),
             Some(function) => (true, Some(function)),
             None => (false, py.import("splat4d.progress")?.call_method0("shown")?.extract::<Option<Py<PyAny>>>()?),
         };
-        Ok(Self { progress, told, loss, raised })
+        Ok(Self { progress, listened, loss, raised })
     }
 
     /// Does the work without Python's lock, passes its events on with it, and raises what was raised meanwhile.
@@ -192,7 +192,7 @@ impl Listener {
             progress.call1(py, (plain(py, &value)?,))?;
         }
         match event {
-            Event::Warning { message } if !self.told => warn(py, std::slice::from_ref(message)),
+            Event::Warning { message } if !self.listened => warn(py, std::slice::from_ref(message)),
             _ => Ok(()),
         }
     }

@@ -1,4 +1,4 @@
-//! From a request to a response: fixed routes, and headers that keep a browser from doing anything else with them.
+//! Responds to requests: fixed routes, with headers that restrict what a browser may do with the responses.
 
 use crate::assets::{self, Asset, INDEX};
 use crate::body::Body;

@@ -40,8 +40,8 @@ const LEAST_TOKEN: usize = 16;
 #[derive(Clone, Debug, Default)]
 pub struct EditResponse {
     /// Sent to the page.
-    pub told: Value,
-    /// The scene from now on, a `.s4d`; `told` gets its number as `version`.
+    pub result: Value,
+    /// The scene from now on, a `.s4d`; `result` gets its number as `version`.
     pub scene: Option<Arc<[u8]>>,
 }
 
@@ -120,7 +120,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
         return text(StatusCode::BAD_REQUEST, "invalid JSON");
     };
     let place = editing.places.clone().acquire_owned().await.expect("a bracket or string is not closed");
-    let (sender, told) = oneshot::channel();
+    let (sender, result) = oneshot::channel();
     let work = editing.answer.clone();
     let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
         let _place = place;
@@ -128,15 +128,15 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
         let _ = sender.send(work(asked));
     });
     // A panic of the work ends its thread, and with it the channel.
-    let done = if spawned.is_ok() { told.await.ok() } else { None };
+    let done = if spawned.is_ok() { result.await.ok() } else { None };
     match done {
         None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the terminal of splat4d shows the reason"),
         Some(Err(error)) => refused(&error),
-        Some(Ok(EditResponse { mut told, scene: fresh })) => {
+        Some(Ok(EditResponse { mut result, scene: fresh })) => {
             if let Some(bytes) = fresh {
-                told["version"] = json!(scene.set(bytes));
+                result["version"] = json!(scene.set(bytes));
             }
-            whole(told.to_string().into(), "application/json")
+            whole(result.to_string().into(), "application/json")
         }
     }
 }

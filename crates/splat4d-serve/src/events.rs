@@ -1,8 +1,8 @@
 //! Events of a live run, for pages that connect, disconnect and reconnect.
 //!
-//! There is no queue per client: news are in one bounded log, and a client is a place in it. So publishing never waits,
-//! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same
-//! log.
+//! There is no queue per client: events are in one bounded log, and a client is a position in it. So publishing never
+//! waits, a slow reader costs only its socket, and a client that joins late or reconnects reads the events it missed
+//! from the same log.
 
 use crate::body::Body;
 use crate::write_timeout::{Either, either};
@@ -83,7 +83,7 @@ impl Log {
     }
 }
 
-/// The log and who waits for it.
+/// The log and its waiting readers.
 #[derive(Debug)]
 pub(crate) struct Hub {
     /// Distinguishes this server's numbers from those of an earlier one at the same address.

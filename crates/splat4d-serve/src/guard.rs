@@ -1,5 +1,5 @@
 //! Access control. A page of any origin in the user's browser can send requests to loopback, and a foreign name can be
-//! made to resolve to this machine (DNS rebinding), after which the browser takes that page for ours. So `Host` must be
+//! made to resolve to this machine (DNS rebinding), after which the browser treats that page as ours. So `Host` must be
 //! a name that only this machine's user has, and `Origin`, where it is sent, must be the same as `Host`.
 
 use hyper::http::request::Parts;
@@ -11,7 +11,7 @@ use std::net::IpAddr;
 #[derive(Clone, Debug)]
 pub(crate) struct Guard {
     /// The host that the user gave, as typed.
-    told: String,
+    served: String,
     /// Bound to more than loopback: an address in numbers is no name, so that no resolver could have been tricked.
     open: bool,
 }
@@ -28,8 +28,8 @@ const fn refusal(status: StatusCode, why: &'static str) -> Refusal {
 }
 
 impl Guard {
-    pub(crate) fn new(told: &str, open: bool) -> Self {
-        Self { told: told.trim_matches(['[', ']']).to_ascii_lowercase(), open }
+    pub(crate) fn new(served: &str, open: bool) -> Self {
+        Self { served: served.trim_matches(['[', ']']).to_ascii_lowercase(), open }
     }
 
     /// Whether a request is allowed. `posts`: whether this path accepts a body, which has rules of its own in addition.
@@ -80,7 +80,7 @@ impl Guard {
         let host = host.trim_matches(['[', ']']).to_ascii_lowercase();
         let address = host.parse::<IpAddr>();
         // Any port: a tunnel (ssh -L) may have another one at its end.
-        host == "localhost" || host == self.told || address.is_ok_and(|a| a.is_loopback() || self.open)
+        host == "localhost" || host == self.served || address.is_ok_and(|a| a.is_loopback() || self.open)
     }
 }
 

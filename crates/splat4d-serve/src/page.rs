@@ -1,8 +1,7 @@
 //! The player and a scene as one static page, which works from any server and straight from a disk.
 //!
-//! A page opened from a disk may not import modules from next to it, so that every module becomes a blob made by the
-//! page itself: in the order of their imports, each with the `'./name.js'` strings in it replaced by the blobs before
-//! it.
+//! A page opened from a disk may not import modules from files next to it. So the page makes a blob of every module: in
+//! the order of their imports, each with the `'./name.js'` strings in it replaced by the blobs before it.
 
 use crate::assets::{INDEX, assets, literal};
 use serde_json::json;

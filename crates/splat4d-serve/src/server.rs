@@ -1,4 +1,5 @@
-//! Starting, running and stopping: one thread with a runtime of its own, and bounds on what strangers can make it hold.
+//! Starting, running and stopping: one thread with its own runtime, and bounds on the memory that clients can make it
+//! use.
 
 use crate::answer::{Shared, answer};
 use crate::edit::Editing;

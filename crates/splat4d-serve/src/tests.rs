@@ -512,7 +512,7 @@ fn editor(asked: &Arc<std::sync::Mutex<Vec<Value>>>) -> Running {
             return Err(splat4d::Error::input("there is nothing to do").remedy("Give a step"));
         }
         let scene = (value["do"] == "bake").then(|| vec![7; 10].into());
-        Ok(EditResponse { told: json!({"heard": value}), scene })
+        Ok(EditResponse { result: json!({"heard": value}), scene })
     });
     start(Config { content: Content::Bytes(bytes(1000).into()), editing: Some(editing), ..Config::default() })
 }
@@ -604,7 +604,7 @@ fn a_run_is_controlled_by_the_rules_of_edits() {
     let heard = asked.clone();
     let control = Editing::new(TOKEN.into(), move |value| {
         heard.lock().unwrap().push(value);
-        Ok(EditResponse { told: json!({"state": "paused"}), scene: None })
+        Ok(EditResponse { result: json!({"state": "paused"}), scene: None })
     });
     let server = start(Config { live: true, control: Some(control), ..Config::default() });
     let pause = br#"{"do": "pause"}"#;

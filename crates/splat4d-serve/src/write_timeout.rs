@@ -1,5 +1,5 @@
-//! A connection whose other end must keep taking bytes. The HTTP library times the head of a request; nothing times a
-//! client that requests much and then reads nothing.
+//! A connection that is closed if the client stops reading. The HTTP library limits the time of a request's head, but
+//! not of a client that requests much and then reads nothing.
 
 use std::future::{Future, poll_fn};
 use std::io;

@@ -1,5 +1,5 @@
-//! Numbers of Gaussians as training images blend them, and the backward pass: what is learnt next to images while
-//! shapes, places and colours are not changed ([`labels`](crate::labels), [`features`](crate::features)).
+//! Values of Gaussians, blended as in the training images, and the backward pass: for values that are learnt while
+//! shapes, positions and colours stay fixed ([`labels`](crate::labels), [`features`](crate::features)).
 
 use crate::capture::Capture;
 use splat4d::layers::{Evaluation, Scene};

@@ -4,7 +4,7 @@
 //! F*|² over the pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so
 //! that the loss has one minimum, which conjugate gradients approach in few rounds without a learning rate (Hestenes
 //! and Stiefel 1952), each channel alone: a round renders every image once, forward and backward. Few rounds also keep
-//! what pixels hardly see from growing.
+//! Gaussians that hardly contribute to pixels from growing.
 //!
 //! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps next to
 //! colours.
@@ -26,7 +26,7 @@ pub const MOST_PICTURES: usize = 240;
 /// ε, weight in pixels of features that are 0: Gaussians that no image shows have none.
 const PRIOR: f64 = 1e-3;
 
-/// How well features are learnt.
+/// Quality of learnt features.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FeatureScores {
     /// Images that were measured.

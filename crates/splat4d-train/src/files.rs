@@ -1,4 +1,4 @@
-//! Files of the user, opened: regular ones only, and no more of them than their length.
+//! Opens the user's files: regular files only, read no further than their length.
 
 use crate::text;
 use splat4d::{Error, Result};

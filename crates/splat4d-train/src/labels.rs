@@ -1,7 +1,7 @@
 //! Labels of a trained scene, learnt from masks of labels in its training images with all else fixed.
 //!
 //! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the
-//! cross-entropy −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the
+//! cross-entropy −Σ_pixels ln P_y, y the pixel's label, is minimised by expectation-maximisation: p_ik becomes the
 //! share of label k in Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and
 //! never makes the loss larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024);
 //! the following ones give a pixel to those of its Gaussians that others agree with. The sums are the renderer's
@@ -28,7 +28,7 @@ const PRIOR: f64 = 1e-3;
 /// Probabilities are kept this far from 0: a wrong mask must not forbid a label forever.
 const LEAST: f64 = 1e-6;
 
-/// How well labels are learnt.
+/// Quality of learnt labels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelScores {
     /// The labels' names.

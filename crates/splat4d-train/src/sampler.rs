@@ -4,7 +4,7 @@ use crate::capture::frames::Frames;
 use splat4d::math::Rng;
 use std::sync::{Arc, Mutex};
 
-/// How a stage draws its frames.
+/// Selection of a stage's frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Sampler {

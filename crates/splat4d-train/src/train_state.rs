@@ -1,4 +1,4 @@
-//! [`TrainState`]: what learns, with all that is remembered of it from step to step, row by row.
+//! [`TrainState`]: the trained parameters with their per-row state (moments, statistics).
 //!
 //! A step changes numbers. Everything else that happens to a learner (rows are added, removed and moved, a hook
 //! replaces the scene, opacities are lowered) uses the methods here, so that scene, moments and statistics cannot get
@@ -10,7 +10,8 @@ mod exposure;
 pub(crate) use corrections::Scale;
 pub use corrections::{Corrections, RefineSettings};
 pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
-pub(crate) use exposure::Exposure;
+pub use exposure::COLUMNS as EXPOSURE_COLUMNS;
+pub(crate) use exposure::{Exposure, expose};
 
 use crate::Result;
 use crate::optim::Moments;
@@ -80,7 +81,7 @@ impl Stats {
     }
 }
 
-/// How far a learner was changed in other ways than by steps.
+/// Extent of changes of the training state other than by steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Touched {
     /// Not at all.
@@ -219,7 +220,7 @@ impl TrainState {
         self.touch(Touched::Rows);
     }
 
-    /// How far it was changed since the last call.
+    /// Extent of its changes since the last call.
     pub(crate) fn take_touched(&mut self) -> Touched {
         std::mem::take(&mut self.touched)
     }

@@ -70,7 +70,7 @@ impl<'a> Training<'a> {
 
 /// A run that has been trained, and its capture.
 pub struct Trained {
-    /// How it ended.
+    /// End of the run.
     pub outcome: Outcome,
     capture: Arc<Capture>,
     antialias: bool,

@@ -58,8 +58,8 @@ const HEAD: &str = "\
 
 All settings of a run, with default and meaning. The size of the scene and its file follows mainly from `densify.max_cap`
 ([how to limit it](file-size.md)), the time from `run.iterations` and `capture.downscale`. `densify.max_cap = 0` derives the number of
-Gaussians from the capture: one for 350 pixels of distinct views, at most 45 per step and what fits the memory, at least 30,000. `train`
-prints the number and the reason. The search of the documentation site finds every setting by its name.
+Gaussians from the capture: one for 350 pixels of distinct views, at most 45 per step, at most what fits into memory, and at least 30,000.
+`train` prints the number and the reason. The search of the documentation site finds every setting by its name.
 
 | page | tables |
 |---|---|
@@ -82,8 +82,8 @@ max_cap = 60000
 - `splat4d train --help-knobs [TOPIC]` prints these tables.
 - The effective settings are stored with every run as `recipe.toml`. Training again from that file repeats the run.
 - Older names without a table, in the last column, also work (`--set max_cap=60000`, or `max_cap = 60000` at the top of the file).
-- A setting without effect (`mcmc.growth` if `densify.strategy` is adc) is refused by `--set` and warned about in a file. A value that
-  disables something disabled is warned about too.
+- A setting without effect (`mcmc.growth` if `densify.strategy` is adc) is refused by `--set` and reported as a warning
+  for a file. A value that switches off something that is off already is also a warning.
 - Settings that count iterations and are 0 follow from `run.iterations`. Rates of positions are in units of the scene's extent (1.1 times the
   largest distance of a training camera from the cameras' centroid), and times in units of the clip length. A recipe therefore carries over
   between scenes of different scale and duration.
@@ -101,7 +101,7 @@ max_cap = 60000
 `--minutes M` replaces the number of steps. M covers the whole command: reading, initial points, a few timed steps (about 6 % of the time,
 more if a step takes a second), training, evaluation, film, baking and report.
 
-- `run.iterations` becomes the number of steps that fit by the timed ones. Rates, densification, SH degrees, half-size images and stages follow
+- `run.iterations` becomes the number of steps that fit, estimated from the timed steps. Rates, densification, SH degrees, half-size images and stages follow
   this *schedule*.
 - If the machine becomes slower or faster, the run is planned again: `run.replans` gets a row [step, total steps], and the rest of the
   schedule is spread evenly over the remaining steps. Operations that are due are done once, never repeated. One step never covers more

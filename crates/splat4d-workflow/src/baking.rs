@@ -1,8 +1,7 @@
 //! A scene becomes a playback file: baked, written, read back and compared with its model.
 //!
-//! How finely motion is cut follows from the bytes that the file may have and from how like its model it is to be: the
-//! model is sampled once, [`Curve`] gives the segments and the error at every price of a segment, and one comparison of
-//! renders calibrates it. Nothing is sampled twice.
+//! The number of segments follows from the size limit and the requested PSNR against the model. The model is sampled
+//! once, [`Curve`] gives segments and error at every price of a segment, and one comparison of renders calibrates it.
 
 use crate::deadline::Deadline;
 use crate::draw::{Painter, color_rgb};

@@ -69,7 +69,7 @@ pub fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     };
     let intrinsics = Intrinsics { fx: number("fx")?, fy: number("fy")?, cx: number("cx")?, cy: number("cy")? };
     if intrinsics.fx < SHORTEST || intrinsics.fy < SHORTEST {
-        return Err(Error::input(format!("the focal length is {} x {}", intrinsics.fx, intrinsics.fy))
+        return Err(Error::input(format!("invalid focal length {} x {}", intrinsics.fx, intrinsics.fy))
             .remedy("Give \"fx\" and \"fy\" in pixels, above zero."));
     }
     let (width, height) = (side("w", "width")?, side("h", "height")?);
@@ -81,8 +81,8 @@ pub fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     let background = match value.get("background").filter(|v| !v.is_null()) {
         None => None,
         Some(v) => {
-            let told = numbers(v).and_then(|n| <[f64; 3]>::try_from(n).ok()).map(|b| b.map(|x| x as f32));
-            Some(told.ok_or_else(|| {
+            let parsed = numbers(v).and_then(|n| <[f64; 3]>::try_from(n).ok()).map(|b| b.map(|x| x as f32));
+            Some(parsed.ok_or_else(|| {
                 Error::input(format!("\"background\" is {v}")).remedy("Give red, green and blue, 0 to 1, as [r, g, b].")
             })?)
         }

@@ -1,4 +1,4 @@
-//! Runs and results of other programs next to each other: what is compared, and whether it can be.
+//! Compares runs and results of other programs, and checks whether their scores are comparable.
 
 use crate::files::grouped;
 use crate::run_folder::{Metrics, Run, ViewScore, newest, view_scores};

@@ -1,4 +1,5 @@
-//! The work behind `compress`: rounds until size and guard are content, the file, scores, comparison and report.
+//! The work behind `compress`: rounds until size limit and quality guard are met, the file, scores, comparison and
+//! report.
 
 use crate::baking;
 use crate::draw::antialias;
@@ -22,7 +23,8 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{TrainOptions, checkpoint};
+use splat4d_train::run::{TrainOptions, checkpoint, corrected};
+use splat4d_train::train_state::EXPOSURE_COLUMNS;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -91,7 +93,7 @@ pub struct CompressOptions {
     pub size: [usize; 2],
     /// Device that renders during fine-tuning; the CPU does the rest.
     pub device: Device,
-    /// How held-out views are measured.
+    /// Options of the evaluation.
     pub measure: Measure,
 }
 
@@ -326,7 +328,8 @@ impl Work {
         })?;
         console.phase("reading the capture", 0, 0);
         let (capture, recipe) = run.open_capture()?;
-        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture) };
+        let exposures = corrected::exposures(&capture, &run.path)?;
+        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), exposures };
         let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
@@ -342,9 +345,9 @@ impl Work {
             }
         };
         if let (Some(before), Some(after)) = (before, after) {
-            let told = self.compare(&source, &original, [&before, &after], stop, recorded)?;
-            print_summary(&told, self.size, console);
-            let text = serde_json::to_string_pretty(&told).expect("results are plain data");
+            let compared = self.compare(&source, &original, [&before, &after], stop, recorded)?;
+            print_summary(&compared, self.size, console);
+            let text = serde_json::to_string_pretty(&compared).expect("results are plain data");
             files::write(&self.dir.join(COMPRESS), text.as_bytes())?;
             evaluating::amend(&self.dir, [("notes".into(), json!(recorded.warnings()))])?;
             console.written(&report::write(&Run::open(&self.dir)?)?);
@@ -387,7 +390,8 @@ impl Work {
         subjects.extend(unpruned.iter().map(|(scene, _)| What::Scene(scene)));
         let subjects: Vec<Subject<'_>> = subjects.into_iter().map(|what| Subject { what, antialias: smooth }).collect();
         let measured_views = measured_views_of(source, self.size)?;
-        let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total))?;
+        let sides =
+            in_turns(&subjects, &measured_views, &mut |done, total| console.phase("timing playback", done, total))?;
         console.clear();
         let mut sides = sides.into_iter();
         let mut next = || sides.next().expect("a side for every subject");
@@ -561,18 +565,30 @@ struct Original<'a> {
     scene: &'a Scene<f32>,
     capture: Arc<Capture>,
     recipe: Recipe,
+    /// What its cameras do to colours, frame by frame.
+    exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
 }
 
 impl Original<'_> {
     fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
-        Job { source: self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings }
+        Job {
+            source: self.scene,
+            capture: self.capture.clone(),
+            recipe: &self.recipe,
+            settings,
+            exposures: &self.exposures,
+        }
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
     fn scores(&self, scene: &Scene<f32>, stop: &AtomicBool, console: &dyn Listener) -> Result<Scores> {
         let store = Arc::new(ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize));
-        let options =
-            EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
+        let options = EvalOptions {
+            antialias: self.recipe.appearance.antialias,
+            pictures: false,
+            exposures: self.exposures.clone(),
+            ..EvalOptions::default()
+        };
         let scores = assess(scene, &self.capture, &store, 0, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         Ok(scores)
@@ -609,9 +625,9 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
-    let fair = told.fair();
-    let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
+fn print_summary(compared: &Compressed, size: [usize; 2], console: &dyn Listener) {
+    let fair = compared.fair();
+    let name = if compared.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(
@@ -629,13 +645,16 @@ fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
         )
     };
     console.result(&line(name, fair));
-    console.result(&line("after", &told.after));
-    if let Some(times) = told.smaller() {
-        let faster = told.after.fps / fair.fps;
+    console.result(&line("after", &compared.after));
+    if let Some(times) = compared.smaller() {
+        let faster = compared.after.fps / fair.fps;
         // The alternative comes first: the plain file, and not the floats of the run.
-        let plain = told.plain.as_ref().filter(|plain| plain.bytes > 0);
+        let plain = compared.plain.as_ref().filter(|plain| plain.bytes > 0);
         let plain = plain.map_or_else(String::new, |plain| {
-            format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
+            format!(
+                "{:.1} times smaller than the plain playback file, ",
+                plain.bytes as f64 / compared.after.bytes as f64
+            )
         });
         // Floats are never shipped: their figure is used only without a plain file.
         let smaller = match plain.is_empty() {

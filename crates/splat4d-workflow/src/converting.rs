@@ -197,9 +197,8 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     let pattern = frames_pattern(args)?;
     let target = Target::of(pattern.as_ref().map_or(&args.output, |p| p.1.as_path()))?;
     if args.time.is_some_and(|t| !t.is_finite()) || args.fps.is_some_and(|f| !(0.01..=1000.0).contains(&f)) {
-        return Err(
-            Error::input("option `time` or option `fps` is out of range").remedy("Give a plain, sensible number.")
-        );
+        return Err(Error::input("invalid option `time` or option `fps`")
+            .remedy("Give a finite time in seconds, and 0.01 to 1000 frames per second."));
     }
     if args.world && !matches!(target, Target::Dialect(_)) {
         return Err(Error::input(format!("a {} stores the offset separately from its positions", target.name()))
@@ -396,7 +395,7 @@ fn write_frames(
     owned.finished();
     console.clear();
     console.result(&format!(
-        "{} files{}, {fps} per second, from {} to {} s, {} in total",
+        "{} files{}, {fps} frames per second, from {:.3} to {:.3} s, {} in total",
         times.len(),
         constant.as_ref().map(|c| format!(" of {} Gaussians each", grouped(c.len()))).unwrap_or_default(),
         times[0],
@@ -431,7 +430,10 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
     scene.rotate(&r);
-    console.result(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
+    console.result(&format!(
+        "axes rotated: up was {old}, is now {}; option `up` keep leaves them unchanged",
+        axis(wanted)
+    ));
     r
 }
 

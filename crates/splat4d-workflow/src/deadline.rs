@@ -1,4 +1,4 @@
-//! [`Deadline`]: what is left of `--minutes` for what follows training; and whether work was stopped.
+//! [`Deadline`]: the time left of `--minutes` for the work after training, and whether the work was stopped.
 
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::Stopwatch;

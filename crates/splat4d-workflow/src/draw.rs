@@ -1,4 +1,4 @@
-//! The seam to the renderer: a scene, a camera and a time become an image for people.
+//! Interface to the renderer: renders a scene, a camera and a time as an image for display.
 
 use crate::events::Listener;
 use crate::paths::View;

@@ -1,5 +1,4 @@
-//! The work behind `edit`: what edits name next to the scene (cameras, masks, other scenes, the capture's images),
-//! found.
+//! The work behind `edit`: finds what edits refer to (cameras, masks, other scenes, the capture's images).
 
 use crate::baking::title;
 use crate::converting::{self, Conversion};
@@ -315,10 +314,10 @@ impl Bring<'_> {
             return Err(Error::input(format!("invalid strength {strength}")).remedy("Give 0 to 1"));
         }
         let (capture, data, antialias) = self.capture()?;
-        let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
+        let measured = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
             self.console.phase("searching for floaters", done, total);
         })?;
-        let found = told.floaters(strength);
+        let found = measured.floaters(strength);
         let mut without = scene.clone();
         for (layer, found) in without.layers.iter_mut().zip(&found) {
             let keep = found.iter().map(|f| !f);

@@ -187,15 +187,15 @@ impl Editor {
     pub fn answer(&self, asked: Value) -> Result<EditResponse> {
         let ask: PageRequest = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
-        let told = |told: Value| Ok(EditResponse { told, scene: None });
+        let result = |result: Value| Ok(EditResponse { result, scene: None });
         match ask {
-            PageRequest::Open { kept } => told(self.open(kept)),
+            PageRequest::Open { kept } => result(self.open(kept)),
             PageRequest::Show { steps, view, t } => {
                 let camera = view.camera()?;
                 let (scene, done) = self.replayed(&steps)?;
                 let mut image = Image::default();
                 draw(&scene, &camera, t, false, &mut image)?;
-                told(json!({ "done": done, "gaussians": scene.len(), "picture": jpeg(&image)? }))
+                result(json!({ "done": done, "gaussians": scene.len(), "picture": jpeg(&image)? }))
             }
             PageRequest::Bake { steps } => {
                 let number = self.bakings.fetch_add(1, Ordering::SeqCst) + 1;
@@ -206,13 +206,13 @@ impl Editor {
                 if newest {
                     self.lock().shown = steps;
                 }
-                Ok(EditResponse { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
+                Ok(EditResponse { result: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
             }
-            PageRequest::Save { steps } => self.save(steps).and_then(told),
+            PageRequest::Save { steps } => self.save(steps).and_then(result),
             PageRequest::Select { steps, select, t } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let selected = self.select(&select, &scene)?;
-                told(held(&select, &scene, &selected, t))
+                result(held(&select, &scene, &selected, t))
             }
             PageRequest::Pick { steps, shape, corners, view, t, through, now } => {
                 let (scene, _) = self.replayed(&steps)?;
@@ -220,7 +220,7 @@ impl Editor {
                 let words = drawn.words(&scene, &view.small()?, t)?;
                 let select = if now && scene.is_moving() { format!("at({}, {words})", number(t)) } else { words };
                 let selected = self.select(&select, &scene)?;
-                told(held(&select, &scene, &selected, t))
+                result(held(&select, &scene, &selected, t))
             }
             PageRequest::Floaters { steps, strength, t } => {
                 let (scene, _) = self.replayed(&steps)?;
@@ -228,13 +228,13 @@ impl Editor {
                 let mut value = held("", &scene, &found.selected, t);
                 value["psnr"] = json!([found.before, found.after]);
                 value["pictures"] = json!(found.pictures);
-                told(value)
+                result(value)
             }
             PageRequest::Bend { steps, select, at, t, nodes } => {
-                self.bend(&steps, &select, [at, t], nodes).and_then(told)
+                self.bend(&steps, &select, [at, t], nodes).and_then(result)
             }
             PageRequest::Pull { number, handles, pins, view } => {
-                self.pull(number, handles, &pins, &view).and_then(told)
+                self.pull(number, handles, &pins, &view).and_then(result)
             }
         }
     }
@@ -478,13 +478,13 @@ mod tests {
         }
 
         fn ask(&self, asked: Value) -> Value {
-            self.editor.answer(asked.clone()).unwrap_or_else(|e| panic!("{asked}: {e}")).told
+            self.editor.answer(asked.clone()).unwrap_or_else(|e| panic!("{asked}: {e}")).result
         }
 
         /// The message for an impossible request; the list is unchanged.
         fn refused(&self, asked: Value) -> String {
             let before = std::fs::read(self.list()).ok();
-            let error = self.editor.answer(asked.clone()).map(|a| a.told).expect_err(&asked.to_string()).to_string();
+            let error = self.editor.answer(asked.clone()).map(|a| a.result).expect_err(&asked.to_string()).to_string();
             assert_eq!(std::fs::read(self.list()).ok(), before, "{asked}");
             error
         }
@@ -500,17 +500,17 @@ mod tests {
         // Around the left ball, at x/z = -0.2.
         let frame = json!([[-0.4, -0.2], [-0.05, 0.2]]);
         let polygon = json!([[-0.4, -0.2], [-0.05, -0.2], [-0.05, 0.2], [-0.4, 0.2]]);
-        for (told, word) in [
+        for (result, word) in [
             (pick("box", frame.clone(), false), "box("),
             (pick("lasso", polygon.clone(), false), "lasso("),
             (pick("lasso", polygon, true), "lasso("),
             (pick("sphere", json!([[-0.2, 0.0], [-0.02, 0.0]]), false), "sphere("),
             (pick("color", json!([[-0.2, 0.0]]), false), "color("),
         ] {
-            assert!(told["select"].as_str().unwrap().starts_with(word), "{told}");
-            let held = told["gaussians"].as_u64().unwrap();
+            assert!(result["select"].as_str().unwrap().starts_with(word), "{result}");
+            let held = result["gaussians"].as_u64().unwrap();
             assert!((180..=200).contains(&held), "{word} {held}");
-            let x = told["center"][0].as_f64().unwrap();
+            let x = result["center"][0].as_f64().unwrap();
             assert!((x + 1.0).abs() < 0.1, "{word} {x}");
         }
         let nothing = bench
@@ -531,7 +531,7 @@ mod tests {
             let [front, both] = [false, true].map(|through| {
                 let ask = json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
                     "through": through, "now": false});
-                editor.answer(ask).unwrap().told
+                editor.answer(ask).unwrap().result
             });
             let held = front["gaussians"].as_u64().unwrap();
             assert!((170..=200).contains(&held), "{shape} {held}");
@@ -640,7 +640,7 @@ mod tests {
             bench.ask(json!({"do": "pull", "number": bent["number"], "handles": [handle], "pins": [], "view": view()}))
         };
         let (rest, moved) = (pull([0.0; 3]), pull([0.0, 0.5, 0.0]));
-        let y = |told: &Value| told["nodes"][0][1].as_f64().unwrap();
+        let y = |result: &Value| result["nodes"][0][1].as_f64().unwrap();
         assert!((y(&moved) - y(&rest) - 0.5).abs() < 1e-5);
         assert_ne!(moved["picture"], rest["picture"]);
     }

@@ -278,7 +278,7 @@ pub fn scores(
     let capture = Arc::new(capture);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure, stop };
     let evaluation = measuring.evaluate(scene, &capture, Measured::Test, None, console)?;
-    amend(run, [("lives".into(), json!(lives(scene)))])?;
+    amend(run, [("lives".into(), json!(lifespans(scene)))])?;
     tracks(run, scene, &capture, console)?;
     flow(run, scene, &capture, &recipe, console)?;
     if capture.held.is_empty() {
@@ -419,6 +419,7 @@ impl Measuring<'_> {
             measured,
             place,
             align: Align::of(capture, self.recipe),
+            exposures: corrected::exposures(capture, &self.opened.path)?,
             device: self.measure.device,
             ..EvalOptions::default()
         };
@@ -434,7 +435,7 @@ impl Measuring<'_> {
 const LIFE_BINS: usize = 10;
 
 /// How many Gaussians can be seen for how much of the clip: in tenths, those that are never seen left out.
-fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
+fn lifespans(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
     let length = (scene.clip[1] - scene.clip[0]).max(f64::MIN_POSITIVE);
     let mut counts = [0; LIFE_BINS];
     for seconds in splat4d::channels::lifetimes(scene).into_iter().flatten().filter(|s| *s > 0.0) {
@@ -504,7 +505,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
     amend(run, [("point_tracks".into(), entry)])
 }
 
-/// Measures rendered flow where the capture brings some along.
+/// Measures rendered flow where the capture has flow files.
 fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &dyn Listener) -> Result<()> {
     if capture.kind != CaptureKind::Own {
         return Ok(());

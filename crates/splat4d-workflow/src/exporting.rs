@@ -93,7 +93,7 @@ pub fn frames(
     owned.finished();
     listener.clear();
     let (from, to) = (times[0], times[times.len() - 1]);
-    listener.result(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
+    listener.result(&format!("{} files, {fps} frames per second, from {from} to {to} s", times.len()));
     listener.written(folder);
     Ok(times.len())
 }
@@ -229,7 +229,7 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
         listener.written(link);
     }
     files::write(out, html.as_bytes())?;
-    listener.result(&format!("a page of {}", files::human_bytes(html.len() as u64)));
+    listener.result(&format!("the page has {}", files::human_bytes(html.len() as u64)));
     listener.written(out);
     if link.is_some() {
         listener.result("put both on a web server: browsers do not let a page opened from disk read another file");

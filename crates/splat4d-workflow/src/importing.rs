@@ -33,7 +33,7 @@ pub struct Imported {
     pub checked: Option<(Checked, PathBuf)>,
 }
 
-/// Makes a capture of videos or folders of images: frames, synchronization, poses, lenses and points. `check`: examines
+/// Makes a capture of videos or folders of images: frames, synchronisation, poses, lenses and points. `check`: examines
 /// the finished capture too and writes `import/doctor.html`. The same request continues interrupted work.
 ///
 /// Errors: the folder contains a capture of another program; videos that cannot be read; poses that cannot be found;

@@ -20,7 +20,7 @@ use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
 use splat4d::{Error, Result};
 use splat4d_import::shipped;
-use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
+use splat4d_train::capture::{self, Aspect, Capture, CaptureKind, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::output::{Owner, check_apart};
 use splat4d_train::path_text::{in_command, to_text};
@@ -64,7 +64,7 @@ const DOUBTS: [&str; 8] = [
 /// Options of [`inspect`].
 #[derive(Clone, Debug, Default)]
 pub struct InspectOptions {
-    /// How a capture is read.
+    /// Options of reading a capture.
     pub recipe: Recipe,
     /// Check a capture's images and poses too, and write `doctor.html` and `doctor.json` into this folder.
     pub doctor: Option<PathBuf>,
@@ -176,11 +176,15 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     let masks = capture.frames.iter().filter(|f| f.mask.is_some()).count();
 
     let mut text = String::new();
-    line(&mut text, "capture", &format!("{} ({:?})", capture.name, capture.kind));
+    let layout = match capture.kind {
+        CaptureKind::Own => "capture.json".to_owned(),
+        other => format!("{other:?}"),
+    };
+    line(&mut text, "capture", &format!("{} ({layout})", capture.name));
     line(&mut text, "cameras", &format!("{fixed} fixed, {moving} moving"));
     let plural = if times.len() == 1 { "" } else { "s" };
     let pictures = format!("{} at {} time{plural}", grouped(capture.frames.len()), grouped(times.len()));
-    line(&mut text, "pictures", &pictures);
+    line(&mut text, "images", &pictures);
     let all: Vec<String> = sizes.iter().map(|s| format!("{}x{}", s[0], s[1])).collect();
     line(&mut text, "size", &all.join(", "));
     let span = format!("{first:.3} to {last:.3} s, {} frames per second", capture.fps);
@@ -269,7 +273,7 @@ fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
     line(&mut text, "size", &sizes.join(", "));
     let rate = found.rate.map_or("unknown".into(), |r| format!("{:.3}", r));
     let seconds = found.seconds.map_or(String::new(), |s| format!("{s:.3} s, "));
-    line(&mut text, "time", &format!("{seconds}{rate} frames a second"));
+    line(&mut text, "time", &format!("{seconds}{rate} frames per second"));
     line(&mut text, "frames", &frames.map_or("the files do not state how many".into(), grouped));
     let [width, height] = found.extracted;
     let extracts = format!(
@@ -311,8 +315,8 @@ fn priors(capture: &Capture) -> Vec<String> {
     type Has = fn(&Frame) -> bool;
     let kinds: [(&str, Has); 3] =
         [("depth", |f| f.depth.is_some()), ("flow", Frame::has_flow), ("tracks", |f| f.tracks.is_some())];
-    let told = kinds.map(|(name, has)| (name, count(has)));
-    told.iter().filter(|(_, n)| *n > 0).map(|(name, n)| format!("{name} of {}", grouped(*n))).collect()
+    let counted = kinds.map(|(name, has)| (name, count(has)));
+    counted.iter().filter(|(_, n)| *n > 0).map(|(name, n)| format!("{name} of {}", grouped(*n))).collect()
 }
 
 fn in_words(reach: &Reach) -> String {
@@ -430,15 +434,15 @@ fn of_file(path: &Path) -> Result<Inspection> {
         None => "splat4d scene",
     };
     line(&mut text, "kind", kind);
-    let told = source.playback.as_ref().map(playback::of_index);
-    if let Some(told) = &told {
-        text.push_str(&told.text);
+    let of_file = source.playback.as_ref().map(playback::of_index);
+    if let Some(of_file) = &of_file {
+        text.push_str(&of_file.text);
     }
     if let Some(from) = &source.provenance {
         let edits = (!from.edits.is_empty()).then(|| format!("{}: {}", from.edits.len(), done(&from.edits)));
-        let told = [("made with", Some(&from.made_with)), ("when", from.when.as_ref()), ("edits", edits.as_ref())];
+        let entries = [("made with", Some(&from.made_with)), ("when", from.when.as_ref()), ("edits", edits.as_ref())];
         let rest = [("capture", from.capture.as_ref()), ("in words", from.words.as_ref())];
-        told.into_iter().chain(rest).filter_map(|(k, v)| Some((k, v?))).for_each(|(k, v)| line(&mut text, k, v));
+        entries.into_iter().chain(rest).filter_map(|(k, v)| Some((k, v?))).for_each(|(k, v)| line(&mut text, k, v));
     }
     if let Some(info) = &source.ply {
         if !info.extra_properties.is_empty() {
@@ -459,9 +463,9 @@ fn of_file(path: &Path) -> Result<Inspection> {
     json["dialect"] = json!(source.dialect.map(|d| d.name));
     json["type"] = json!(if source.ply.is_some() { "ply" } else { "scene" });
     json["bytes"] = json!(bytes);
-    if let Some(told) = told {
+    if let Some(of_file) = of_file {
         json["type"] = json!("playback");
-        json["playback"] = told.json;
+        json["playback"] = of_file.json;
     }
     Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new(), poses_unchecked: false })
 }

@@ -113,11 +113,11 @@ fn learn_features(
             scores.pictures,
             scores.cosine
         ));
-        let told = json!({
+        let entry = json!({
             "channels": channels, "views": views, "pictures": scores.pictures, "explained": scores.explained,
             "cosine": scores.cosine, "losses": losses,
         });
-        amend(run, [("features".into(), told)])?;
+        amend(run, [("features".into(), entry)])?;
     }
     console.emit(&json!({"type": "featured", "channels": scene.feature_channels()}));
     Ok(())

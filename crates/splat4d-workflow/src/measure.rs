@@ -1,6 +1,6 @@
-//! How a scene plays on this machine's CPU: who is alive, how many bytes, frames per second rendered from the capture's
-//! own cameras over its clip. Compared variants are measured alternately, image by image, so that a machine that is
-//! busy for a while slows all of them.
+//! Playback of a scene on this machine's CPU: Gaussians alive, bytes, and frames per second from the capture's cameras
+//! over its clip. Compared variants are measured alternately, image by image, so that a machine that is busy for a
+//! while slows all of them.
 
 use crate::draw::color_into;
 use crate::paths::View;

@@ -1,5 +1,5 @@
-//! The work behind `predict`: nodes of what was observed, the ladder's forecasts, their scenes, and their
-//! scores on the images that training never saw.
+//! The work behind `predict`: nodes of the observed part, forecasts of all models, their scenes, and their scores on
+//! images that training did not use.
 
 mod assimilate;
 mod score;
@@ -207,7 +207,7 @@ impl Work {
             cases.push(views.cases(self, &f.scene, stop)?);
         }
         console.clear();
-        let mut told = Vec::new();
+        let mut scored = Vec::new();
         for (f, own) in forecasts.iter().zip(&cases) {
             let mut model_scores = scores(f.model.name(), own, [&cases[0], &cases[1]], self.horizon);
             model_scores.seconds_fit = f.seconds[0];
@@ -218,7 +218,7 @@ impl Work {
             model_scores.calibration =
                 truth.as_ref().zip(f.spread.as_ref()).and_then(|(t, s)| calibration(&f.moments, s, t));
             model_scores.track_error = views.track_errors(self, &f.moments);
-            told.push(model_scores);
+            scored.push(model_scores);
         }
         let oracle = match &oracle {
             Some(scene) => {
@@ -234,7 +234,7 @@ impl Work {
             true => Some(assimilate::run(self, best, &views, [&cases[0], &cases[1]], stop, console)?),
             false => None,
         };
-        let told = Summary {
+        let summary = Summary {
             run: self.order.run.clone(),
             until: self.clock.until,
             fps: self.clock.fps,
@@ -247,15 +247,15 @@ impl Work {
             size: self.observed.size,
             actions: self.order.actions.as_ref().map_or_else(Vec::new, |a| a.names.clone()),
             seeds: self.order.seeds,
-            models: told,
+            models: scored,
             oracle,
             assimilated,
             scene: best.model.name(),
         };
-        write::all(self, &folder, &told, &forecasts, best, console)?;
+        write::all(self, &folder, &summary, &forecasts, best, console)?;
         let films = if self.order.film { views.films(self, &folder, best, stop, console)? } else { Vec::new() };
-        let page = report::predict::write(&folder, &self.run.name(), &told, &films)?;
-        print_summary(&told, console);
+        let page = report::predict::write(&folder, &self.run.name(), &summary, &films)?;
+        print_summary(&summary, console);
         console.written(&page);
         Ok(())
     }
@@ -364,10 +364,10 @@ impl Work {
 }
 
 /// The figures in the terminal.
-fn print_summary(told: &Summary, console: &dyn Listener) {
+fn print_summary(summary: &Summary, console: &dyn Listener) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| report::predict::rounded(x, digits));
     console.result("model          PSNR  dynamic regions     skill over freeze  over velocity");
-    for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {
+    for m in summary.models.iter().chain(&summary.assimilated).chain(&summary.oracle) {
         console.result(&format!(
             "{:<13}{:>6}{:>12} dB{:>18}{:>17}   fitted in {}",
             m.name,

@@ -209,7 +209,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     not_empty(scene, path)?;
     let route = args.path.clone().unwrap_or(Route::Orbit);
     let views = source.views()?;
-    let told = match &route {
+    let of_route = match &route {
         Route::Keys(file) => paths::fps_of(file)?,
         _ => None,
     };
@@ -219,7 +219,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
         freeze: args.freeze,
         slow_motion: args.slow_motion,
         seconds: args.seconds,
-        fps: args.fps.or(told).unwrap_or(FPS),
+        fps: args.fps.or(of_route).unwrap_or(FPS),
     };
     if clock.to < clock.from {
         return Err(Error::input(format!(

@@ -174,9 +174,9 @@ impl Run {
 
     /// The capture's name.
     pub fn name(&self) -> String {
-        let told = self.info.get("capture_name").and_then(Value::as_str).map(str::to_owned);
+        let recorded = self.info.get("capture_name").and_then(Value::as_str).map(str::to_owned);
         let folder = || self.path.file_name().map(|n| n.to_string_lossy().into_owned());
-        told.or_else(folder).unwrap_or_else(|| "run".into())
+        recorded.or_else(folder).unwrap_or_else(|| "run".into())
     }
 
     /// A number of `run.json`.
@@ -203,8 +203,8 @@ impl Run {
 
     /// Steps taken, where recorded.
     pub fn iteration(&self) -> Option<usize> {
-        let told = self.number("iteration").map(|n| n as usize);
-        told.or(self.iteration).or_else(|| self.metrics.last().map(|m| m.iteration as usize))
+        let recorded = self.number("iteration").map(|n| n as usize);
+        recorded.or(self.iteration).or_else(|| self.metrics.last().map(|m| m.iteration as usize))
     }
 
     /// A held-out score.
@@ -255,8 +255,8 @@ impl Run {
     /// The folder of the newest held-out images.
     pub fn pictures(&self) -> Option<PathBuf> {
         let test = self.path.join("test");
-        let told = self.iteration.map(|n| test.join(format!("ours_{n}")));
-        told.filter(|p| p.is_dir()).or_else(|| {
+        let recorded = self.iteration.map(|n| test.join(format!("ours_{n}")));
+        recorded.filter(|p| p.is_dir()).or_else(|| {
             let folders = std::fs::read_dir(&test).ok()?.flatten().map(|e| e.path()).filter(|p| p.is_dir());
             folders.max_by_key(|p| step_of(&p.file_name()?.to_string_lossy()))
         })

@@ -1,4 +1,4 @@
-//! How far a run is, and who works on it; of a long take in chunks, part by part.
+//! Progress and workers of a run; of a long capture in chunks, part by part.
 
 use crate::files::{grouped, human_seconds};
 use crate::run_folder::Run;
@@ -11,7 +11,7 @@ use splat4d_train::run::chunks::{Chunked, Part};
 use std::fmt::Write;
 use std::path::Path;
 
-/// How far a part is.
+/// Progress of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
@@ -48,7 +48,7 @@ pub struct PartStatus {
     peak_memory: Option<u64>,
 }
 
-/// How far a run is.
+/// Progress of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Status {
     #[serde(rename = "type")]

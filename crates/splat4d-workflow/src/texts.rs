@@ -1,4 +1,4 @@
-//! The texts that people give to verbs, read: for the fuzz targets.
+//! Readers of texts that users give to commands: for the fuzz targets.
 
 use crate::compressing::CompressJob;
 use crate::editor::Editor;

@@ -61,7 +61,7 @@ pub struct TrainingOptions {
     pub chunk: Option<ChunkSelection>,
     /// Device to train on.
     pub device: Device,
-    /// How held-out views are measured.
+    /// Options of the evaluation.
     pub measure: Measure,
     /// Work after training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states
     /// chunks.

@@ -1,4 +1,4 @@
-//! The device that renders: the GPU where there is one that can, else the CPU, and a sentence that states why.
+//! Selects the rendering device: a suitable GPU if there is one, otherwise the CPU; and reports why.
 
 mod resident;
 #[cfg(test)]

@@ -20,7 +20,7 @@ pub enum ErrorKind {
     Memory,
     /// Training diverged and could not be rolled back (exit code 1).
     Diverged,
-    /// The user asked to stop; what was done is saved (exit code 1).
+    /// The user requested a stop; finished work is saved (exit code 1).
     Interrupted,
 }
 

@@ -54,7 +54,7 @@ impl ReadAt for &[u8] {
 /// When the rows of one layer are alive.
 #[derive(Debug, Default)]
 struct Alive {
-    /// No Gaussian is born or dies: all rows are used.
+    /// All Gaussians are always alive: all rows are used.
     all: bool,
     /// [from, to] of every row, seconds; from > to: never.
     spans: Vec<[f64; 2]>,
@@ -138,7 +138,7 @@ impl<'a> Held<'a> {
         Self { section, layer, alive, ids: Vec::new(), evaluation: Evaluation::default(), bytes }
     }
 
-    /// Looks up who is alive at t; returns how many.
+    /// Finds the Gaussians alive at t; returns their number.
     fn look_up(&mut self, t: Time) -> usize {
         if self.alive.all {
             return self.layer.params.len();

@@ -2,9 +2,9 @@
 //!
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
 //! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ
-//! in the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under
-//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here: this is the
-//! one file of the workspace that states `unsafe`.
+//! in rounding: the scalar level has no fused multiply-adds, and the blend under AVX-512 steps differently from row to
+//! row. On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here, which needs
+//! `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
 use std::sync::atomic::{AtomicU8, Ordering};

@@ -1,7 +1,7 @@
 //! Text from files, made safe to display: titles, notes, names of cameras, labels and files.
 //!
-//! A terminal obeys control characters: an escape sequence in a title could set the clipboard or clear the screen, and
-//! formatting characters for bidirectional text could reorder what is read. Who prints passes everything through here.
+//! Terminals execute control characters: an escape sequence in a title could set the clipboard or clear the screen, and
+//! formatting characters for bidirectional text could reorder the output. All printed text passes through this module.
 
 use std::borrow::Cow;
 

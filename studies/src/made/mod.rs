@@ -325,10 +325,10 @@ hand-held-60 36359dac295000bb
         let wrong = of("wrong-pose");
         let turned: Vec<&Viewer> = wrong.viewers.iter().filter(|v| v.wrong != 0.0).collect();
         let [camera] = turned[..] else { panic!("one camera is turned") };
-        let (own, told) = (camera.at(0), camera.at(0).turned(camera.wrong));
-        let angle = dot(own.cam_from_world.rotation[2], told.cam_from_world.rotation[2]).acos().to_degrees();
-        assert!((angle - 3.0).abs() < 1e-9 && norm(sub(own.center(), told.center())) < 1e-12);
-        assert!(told.cam_from_world.orthogonality_error() < 1e-12 && !camera.held);
+        let (own, stated) = (camera.at(0), camera.at(0).turned(camera.wrong));
+        let angle = dot(own.cam_from_world.rotation[2], stated.cam_from_world.rotation[2]).acos().to_degrees();
+        assert!((angle - 3.0).abs() < 1e-9 && norm(sub(own.center(), stated.center())) < 1e-12);
+        assert!(stated.cam_from_world.orthogonality_error() < 1e-12 && !camera.held);
         // The entering object is in no image of the first half, and in all of the last.
         let enters = of("enters");
         let number = enters.world.things.len() - 1;

@@ -244,7 +244,7 @@ mod tests {
         let head = "[quick]\nsteps = 1\n[full]\nsteps = 2\n[[capture]]\n";
         let parse = |entry: &str| List::parse(&format!("{head}{entry}"));
         assert!(parse("name = \"a\"\ndata = \"a\"").is_ok());
-        for (entry, told) in [
+        for (entry, expected) in [
             ("name = \"a\"", "exactly one location"),
             ("name = \"a\"\ndata = \"a\"\nmade = \"enters\"", "exactly one location"),
             ("name = \"a\"\nmade = \"leaves\"", "enters"),
@@ -256,7 +256,7 @@ mod tests {
             ("name = \"a\"\ndata = \"a\"\nsteps = 5", "steps"),
         ] {
             let message = parse(entry).unwrap_err().to_string();
-            assert!(message.contains(told), "{entry}: {message}");
+            assert!(message.contains(expected), "{entry}: {message}");
         }
         let none = List::parse("[quick]\nsteps = 0\n[full]\nsteps = 2\n[[capture]]\nname = \"a\"\ndata = \"a\"");
         assert!(none.unwrap_err().to_string().contains("no steps"));

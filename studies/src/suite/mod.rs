@@ -217,8 +217,8 @@ fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console
                 // Training views are evaluated at every checkpoint.
                 recipe.run.checkpoint_interval = (recipe.run.iterations / PROBES).max(1);
             }
-            let told = [program.as_str(), &folder.display().to_string(), &recipe.flat_toml()].join("\n");
-            orders.push(Order { entry, folder: folder.clone(), recipe, print: files::fingerprint(told) });
+            let content = [program.as_str(), &folder.display().to_string(), &recipe.flat_toml()].join("\n");
+            orders.push(Order { entry, folder: folder.clone(), recipe, print: files::fingerprint(content) });
         }
     }
     Ok(orders)

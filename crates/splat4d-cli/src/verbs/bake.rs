@@ -55,7 +55,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = &args.output;
     if !(1..=MAX_REPEAT).contains(&args.repeat) || !(1..=MAX_PALETTE).contains(&args.palette) {
         return Err(Error::input("--repeat or --palette is out of range")
-            .remedy(format!("Give 1 to {MAX_REPEAT} rounds and 1 to {MAX_PALETTE} entries."))
+            .remedy(format!("Give --repeat 1 to {MAX_REPEAT} and --palette 1 to {MAX_PALETTE}."))
             .into());
     }
     let baking = Baking {

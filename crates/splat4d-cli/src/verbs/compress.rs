@@ -27,7 +27,7 @@ unchanged. docs/compression.md explains the settings.";
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub(crate) struct Args {
-    /// The run; its capture must still be at its place
+    /// The run; its capture must be where it was during training
     #[arg(value_name = "RUN", required_unless_present = "resume")]
     run: Option<PathBuf>,
     /// Output folder [default: RUN-compressed, or RUN-compressed-2 ... if it exists]
@@ -90,7 +90,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What is to be done.
+/// The requested work.
 fn options(args: &Args) -> CompressOptions {
     CompressOptions {
         output: args.output.clone(),

@@ -1,4 +1,4 @@
-//! `eval`: measures a run again, perhaps next to a scene that is static.
+//! `eval`: measures a run again, optionally against a static scene.
 
 use crate::console::Console;
 use crate::device::Device;
@@ -29,7 +29,7 @@ Results are in RUN/results.json and RUN/per_view.json (keys as in 3DGS), images 
 --background only compute scores; results of another split or background have their own entry and folder, such as \
 `val` or `test-black`.";
 
-/// What transparent pixels are composited on.
+/// Background of transparent pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Background {
     /// Black

@@ -1,5 +1,5 @@
-//! `export`: times of a scene as plain 3DGS .ply files, the whole as one page with its player, or the positions of its
-//! Gaussians or of requested points as JSON or CSV.
+//! `export`: a scene at one or several times as 3DGS .ply files, the whole scene as one page with its player, or
+//! positions of Gaussians or of requested points as JSON or CSV.
 
 use crate::console::Console;
 use serde_json::json;
@@ -101,8 +101,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let path = args.source.as_ref().or(args.model.as_ref()).expect("clap requires a source");
     for (name, value) in [("--time", args.time), ("--fps", args.fps), ("--from", args.from), ("--to", args.to)] {
         if value.is_some_and(|v| !v.is_finite() || (name == "--fps" && !(0.01..=1000.0).contains(&v))) {
-            return Err(Error::input(format!("{name} is out of range"))
-                .remedy("Give a plain, sensible number.")
+            return Err(Error::input(format!("invalid {name}"))
+                .remedy("Give a finite number; frames per second from 0.01 to 1000.")
                 .into());
         }
     }

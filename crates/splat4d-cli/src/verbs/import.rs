@@ -1,4 +1,4 @@
-//! `import`: videos become a capture: frames, a common clock, poses and points.
+//! `import`: makes a capture from videos: frames, synchronisation, poses and points.
 
 use crate::console::Console;
 use crate::interrupt;
@@ -21,7 +21,7 @@ Examples:
 my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
 the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";
 
-/// Make a capture from videos: frames, synchronization, poses, lenses and points
+/// Make a capture from videos: frames, synchronisation, poses, lenses and points
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

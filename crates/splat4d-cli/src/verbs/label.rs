@@ -1,4 +1,4 @@
-//! `label`: labels and features learnt into a trained run from masks and images of features.
+//! `label`: learns labels and features of a trained run from masks and feature images.
 
 use crate::console::Console;
 use crate::interrupt;

@@ -1,4 +1,4 @@
-//! `localise`: from where and when images of a scene were taken.
+//! `localise`: finds the pose and time of images of a scene.
 
 use crate::console::Console;
 use splat4d_workflow::localising::{LocaliseOptions, localise};
@@ -10,9 +10,9 @@ Examples:
   splat4d localise runs/knight a.png b.png -o found.json   cameras in the format of `cameras.json`
   splat4d localise scene.ply photo.jpg --start cam.json    near this camera, with its lens
 
-Images must be undistorted and have the shape of the starts: the lens is that of the best start, or found with --lens. \
-Exposure and white balance may differ from the scene's. A start within about 20° of the image is needed. An image is \
-refused if more than a third of its difference from one plain colour remains.";
+Images must be undistorted and have the aspect ratio of the start cameras. The lens is that of the best start camera, or \
+found with --lens. Exposure and white balance may differ from the scene's. A start camera within about 20° of the image \
+is needed. An image is refused if the final difference is more than a third of its difference from one plain colour.";
 
 /// Find pose and time of images of a scene
 #[derive(Debug, clap::Args)]
@@ -22,7 +22,7 @@ pub(crate) struct Args {
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     /// The images: JPEG, PNG or WebP, each localised independently
-    #[arg(value_name = "PICTURE", required = true)]
+    #[arg(value_name = "IMAGE", required = true)]
     pictures: Vec<PathBuf>,
     /// Start from this camera (a camera file), or these (a cameras.json) [default: the run's cameras]
     #[arg(long, value_name = "FILE")]

@@ -1,4 +1,4 @@
-//! `predict`: how a run that saw a part of its take continues, compared with the part that it did not see.
+//! `predict`: forecasts of a run that was trained on the first part of its clip, compared with the rest.
 
 use crate::console::Console;
 use crate::interrupt;
@@ -18,7 +18,7 @@ Examples:
   splat4d predict runs/seen --model koopman --horizon 90   three seconds, partly without comparison
   splat4d predict runs/seen --model graph --seeds 3     an ensemble, with its uncertainty
   splat4d predict runs/block --actions actions.csv      known actions, one row per frame
-  splat4d predict runs/seen --oracle runs/all           compare with a run that saw everything
+  splat4d predict runs/seen --oracle runs/all           compare with a run trained on the whole clip
   splat4d predict runs/seen --assimilate                correct by each new frame
 
 Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (the motion model at later times), \
@@ -35,7 +35,7 @@ const MAX_SEEDS: u64 = 16;
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// The run, trained with --observe; its capture must still be at its place
+    /// The run, trained with --observe; its capture must be where it was during training
     #[arg(value_name = "RUN")]
     run: PathBuf,
     /// Frames to predict [default: as many as have images]
@@ -63,7 +63,7 @@ pub(crate) struct Args {
     /// Correct the prediction by each new frame: predict, render, compare, update
     #[arg(long)]
     assimilate: bool,
-    /// A run of the same capture that saw all of it: the upper bound
+    /// A run of the same capture, trained on the whole clip: the upper bound
     #[arg(long, value_name = "RUN")]
     oracle: Option<PathBuf>,
     /// Skip films of truth and prediction

@@ -1,4 +1,4 @@
-//! `status`: how far a run is, and who works on it; of a long take in chunks, part by part.
+//! `status`: progress and workers of a run; of a long capture in chunks, part by part.
 
 use crate::console::Console;
 use splat4d_workflow::status;
@@ -9,9 +9,9 @@ Examples:
   splat4d status runs/concert           parts, who trains which, time left
   splat4d status runs/concert --json    the same as one JSON object, for schedulers
 
-It only reads: run it at any time, on any machine that has the folder. Steps are those of the last checkpoint.";
+It only reads files: run it at any time, on any machine that has the folder. Steps are those of the last checkpoint.";
 
-/// Print how far a run is and who works on it, part by part
+/// Print the progress and the workers of a run, part by part
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

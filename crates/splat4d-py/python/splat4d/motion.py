@@ -13,14 +13,15 @@ class Motion:
     opacities [N] and, with `colors=True`, colours [N, 3] (without, the spherical harmonics are shown). `params` is a dict of
     arrays: `means` [N, 3], `quats` [N, 4], `log_scales` [N, 3], `opacity_logits` [N] and `sh` [N, K, 3] of the canonical
     Gaussians that are requested, and the model's own, which start at zero or as they are given: `per_gaussian` (name:
-    numbers a Gaussian), whose rows are copied and removed with the Gaussians, and `shared` (name: array).
+    numbers per Gaussian), whose rows are copied and removed with the Gaussians, and `shared` (name: array).
 
     With PyTorch, `params` are tensors, and gradients come from autograd. Without, give `backward(params, t, d_means, d_quats,
     d_scales, d_opacities, d_colors)`, which returns a dict of gradients by the names of `params` (and of `time`, if the
     clocks of cameras are to be refined).
 
-    `rates` (name: rate, or (first, last)) are learning rates of the model's own arrays; those without one stay as they are.
-    The Gaussians learn at the recipe's. In the first `warmup` of the steps only the Gaussians learn, standing still.
+    `rates` (name: rate, or (first, last)) are learning rates of the model's own arrays; arrays without a rate are not changed.
+    The Gaussians are trained at the recipe's rates. In the first `warmup` share of the steps only they are trained, as a
+    static scene.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 //! Content that a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
 
-/// How bad a [`Finding`](super::Finding) is.
+/// Severity of a [`Finding`](super::Finding).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
     /// For information.
@@ -42,7 +42,7 @@ impl Aspect {
 pub struct Remark {
     /// Its subject.
     pub aspect: Aspect,
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
     /// The sentence.
     pub what: String,

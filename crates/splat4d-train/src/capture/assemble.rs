@@ -200,7 +200,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     pose::check_intrinsics(&source.intrinsics, source.width, source.height).map_err(place)?;
     source.cam_from_world = pose::checked(source.cam_from_world).map_err(place)?;
     if frame.time.is_nan() || frame.time.abs() > pose::LATEST {
-        let what = format!("its time is {} s", pose::short(frame.time));
+        let what = format!("invalid time {} s", pose::short(frame.time));
         return Err(place(Error::input(what).remedy("Give its time in seconds from the start of the clip.")));
     }
     if source.width < options.downscale || source.height < options.downscale {
@@ -275,7 +275,7 @@ fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
                 continue;
             }
             let (a, b) = (a.camera.min(b.camera), a.camera.max(b.camera));
-            let what = format!("cameras {} and {} have one pose", cameras[a].name, cameras[b].name);
+            let what = format!("cameras {} and {} have the same pose", cameras[a].name, cameras[b].name);
             return Err(Error::input(what).at(take.root.display()).remedy(
                 "A matrix was probably copied from one to the other: correct it, or remove one of the cameras.",
             ));
@@ -595,11 +595,11 @@ type Indices = Vec<usize>;
 
 /// The training, held-out and validation frames.
 fn split(take: &mut RawCapture, cameras: &[Rig], options: &CaptureOptions) -> Result<(Indices, Indices, Indices)> {
-    let told = options.hold_out.clone().or_else(|| take.hold_out.clone());
+    let stated = options.hold_out.clone().or_else(|| take.hold_out.clone());
     let of = |split: Split| -> Indices { (0..take.frames.len()).filter(|&i| take.frames[i].split == split).collect() };
     let validation = of(Split::Validation);
     let by_convention = of(Split::Held);
-    let rule = match told {
+    let rule = match stated {
         Some(rule) => rule,
         None if !by_convention.is_empty() => {
             let train = of(Split::Train);

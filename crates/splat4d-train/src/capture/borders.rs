@@ -3,9 +3,9 @@
 //! cameras, and no scene can be scored there.
 //!
 //! A pixel belongs to a border if it is black in all sampled images of one lens and connected to the image's edge by
-//! such pixels. That alone would also find the black background of a photographed object. The content next to a border
-//! is what is anywhere in the scene, next to the object's outline it is the background again: so a border counts only
-//! if the images are mostly bright a few pixels further inside.
+//! such pixels. That alone would also find the black background of a photographed object. Next to a border there is
+//! scene content, next to an object's outline there is background: so a border counts only if the images are mostly
+//! bright a few pixels further inside.
 //!
 //! The same images are examined for every part of a capture: the first image of each fixed camera, and images of moving
 //! ones evenly. The parts of one run get what the first of them found ([`Lenses`]).

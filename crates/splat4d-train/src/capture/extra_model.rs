@@ -1,4 +1,4 @@
-//! Two descriptions of the same cameras: whether they agree, and how one world is in the other.
+//! Compares two descriptions of the same cameras: whether they agree, and the similarity between their worlds.
 
 use super::rig;
 use splat4d::math::se3::{dot, mat_mul, norm, sub, transpose};

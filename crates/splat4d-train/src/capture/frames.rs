@@ -115,7 +115,7 @@ impl Picture {
 
 /// The images a scene is trained on.
 pub trait Frames: Send + Sync {
-    /// How many.
+    /// Count.
     fn len(&self) -> usize;
     /// Whether there is none.
     fn is_empty(&self) -> bool {
@@ -137,7 +137,7 @@ pub trait Frames: Send + Sync {
     fn has_depth(&self) -> bool {
         false
     }
-    /// How far matches of frames of moving cameras agree with a static scene; `None`: undetermined.
+    /// Agreement of matches between frames of moving cameras with a static scene; `None`: undetermined.
     fn agreement(&self) -> Option<Agreement> {
         None
     }

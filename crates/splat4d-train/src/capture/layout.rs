@@ -1,6 +1,5 @@
-//! Which layout a folder has: markers in a stated order, what is next to the one that is taken, and what to do
-//! where there
-//! is none.
+//! Finds the layout of a folder: markers in a stated order, warnings about further markers, and remedies where there is
+//! none.
 
 use super::account::first_names;
 use super::{

@@ -34,7 +34,7 @@ const KNOWN_ENDINGS: &[&str] = &[
     "cr2", "cr3", "nef", "ppm", "pgm", "exr", "tga",
 ];
 
-/// How a name differs from the file found for it.
+/// Difference of a name from the file found for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Way {
     Slashes,

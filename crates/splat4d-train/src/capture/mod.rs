@@ -195,7 +195,7 @@ pub enum Split {
     Future,
 }
 
-/// How much there is of a capture.
+/// Size of a capture.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Extent {
     /// The first frame number, and the one after the last.
@@ -425,6 +425,11 @@ impl Capture {
         } else {
             Split::Train
         }
+    }
+
+    /// Whether it consists of photos of a moment, whose cameras have no names: each photo is its own camera.
+    pub(crate) fn of_photos(&self) -> bool {
+        self.timing == Timing::Moment && !self.named
     }
 
     /// The views of the training cameras: one of every fixed camera, all of moving ones.

@@ -154,23 +154,23 @@ pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severi
 /// not shift those after it; else their order.
 fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
     let named = |image: &PathBuf| rig::trailing_number(&image.file_name()?.to_string_lossy());
-    let told: Option<Vec<Vec<usize>>> =
+    let numbers: Option<Vec<Vec<usize>>> =
         folders.iter().map(|f| f.images.iter().map(named).collect::<Option<Vec<usize>>>()).collect();
     let in_order = || folders.iter().map(|f| (0..f.images.len()).collect()).collect();
-    let Some(mut told) = told else { return in_order() };
-    let all: BTreeSet<usize> = told.iter().flatten().copied().collect();
+    let Some(mut numbers) = numbers else { return in_order() };
+    let all: BTreeSet<usize> = numbers.iter().flatten().copied().collect();
     let (Some(&first), Some(&last)) = (all.first(), all.last()) else { return in_order() };
     // Cameras that number their frames apart, or share a number, carry no information about each other's time.
-    let apart = (0..told.len()).any(|c| {
+    let apart = (0..numbers.len()).any(|c| {
         let others: BTreeSet<usize> =
-            told.iter().enumerate().filter(|(k, _)| *k != c).flat_map(|(_, n)| n.clone()).collect();
-        let shared = told[c].iter().filter(|n| others.contains(n)).count();
-        told[c].windows(2).any(|w| w[0] == w[1]) || told.len() > 1 && 2 * shared < told[c].len()
+            numbers.iter().enumerate().filter(|(k, _)| *k != c).flat_map(|(_, n)| n.clone()).collect();
+        let shared = numbers[c].iter().filter(|n| others.contains(n)).count();
+        numbers[c].windows(2).any(|w| w[0] == w[1]) || numbers.len() > 1 && 2 * shared < numbers[c].len()
     });
     if apart || last - first > rig::MAX_SPAN {
         return in_order();
     }
-    let lost: Vec<String> = (folders.iter().zip(&told))
+    let lost: Vec<String> = (folders.iter().zip(&numbers))
         .filter(|(_, numbers)| numbers.len() < all.len())
         .map(|(f, numbers)| format!("{} ({})", f.name, all.len() - numbers.len()))
         .collect();
@@ -181,8 +181,8 @@ fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
         );
         account.add(Aspect::NotFound, Severity::Warning, what);
     }
-    told.iter_mut().flatten().for_each(|n| *n -= first);
-    told
+    numbers.iter_mut().flatten().for_each(|n| *n -= first);
+    numbers
 }
 
 fn mismatch(rows: usize, folders: &[Folder], films: &[String]) -> Error {

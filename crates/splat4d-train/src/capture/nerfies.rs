@@ -178,9 +178,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let first = frames.iter().map(|f| f.index).min().unwrap_or(0);
     let length = (last - first) as f64 / fps;
     let rate = match (options.fps, stated) {
-        (None, None) => format!("The layout states no frame rate: frames {first} to {last} at {fps} a second"),
-        (None, Some(_)) => format!("Frames {first} to {last} at the {fps} a second of extra.json"),
-        (Some(_), _) => format!("Frames {first} to {last} at {fps} a second, as given"),
+        (None, None) => format!("The layout states no frame rate: frames {first} to {last} at {fps} frames per second"),
+        (None, Some(_)) => format!("Frames {first} to {last} at the {fps} frames per second of extra.json"),
+        (Some(_), _) => format!("Frames {first} to {last} at {fps} frames per second, as given"),
     };
     account.add(Aspect::Assumed, Severity::Note, format!("{rate}: {length:.3} s."));
     if left_out > 0 {

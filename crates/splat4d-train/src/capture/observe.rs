@@ -1,4 +1,4 @@
-//! The part of a capture that may be seen, and the future that may not: what scores a prediction must not have made it.
+//! Splits a capture into the observed part and the future. Frames that score a forecast must not influence it.
 
 use super::{Capture, assemble};
 use splat4d::{Error, Result};

@@ -82,7 +82,7 @@ impl Value for Option<HoldOut> {
 const NEAR: f64 = 0.2;
 
 choices! {
-    /// How to interpret images without times.
+    /// Interpretation of images without times.
     pub enum Sequence {
         /// By their names: a film where they are numbered like its frames, else photos.
         Auto = "auto",
@@ -167,8 +167,8 @@ settings! {
         flow: FlowSource = FlowSource::Files => any().when(On("loss.flow"));
         /// Number of frames of the capture to use; 0: all.
         max_frames: usize = 0 => any().unit("frames");
-        /// Near distance of cameras, of the extent; less if the capture's points are nearer, a quarter of it without
-        /// points.
+        /// Near distance of cameras, share of the extent; less if the capture's points are nearer, a quarter of it
+        /// without points.
         near: f64 = NEAR => below_one().unit("extents");
         /// Share of the clip for training; later frames only score forecasts. 1: all.
         observe: f64 = 1.0 => share();
@@ -196,7 +196,7 @@ settings! {
     }
 }
 
-/// How a capture is read. `CaptureOptions::default()` follows the data set's own conventions.
+/// Options of reading a capture. `CaptureOptions::default()` follows the data set's own conventions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
     /// Images become means of k×k boxes; 1 keeps them. Rows and columns that fill no box are cut off.
@@ -205,7 +205,7 @@ pub struct CaptureOptions {
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// How to interpret images without times.
+    /// Interpretation of images without times.
     pub sequence: Sequence,
     /// The background of transparent pixels, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
@@ -310,7 +310,7 @@ impl CaptureOptions {
     }
 }
 
-/// Fastest camera that is believed, frames per second; also the longest take in seconds that is.
+/// Fastest camera that is accepted, frames per second; also the longest take in seconds that is.
 const MAX_RATE: f64 = 1e6;
 
 /// An error unless 0 < value ≤ 10⁶.
@@ -318,7 +318,7 @@ pub(super) fn check_rate(name: &str, value: f64) -> Result<()> {
     if value.is_finite() && value > 0.0 && value <= MAX_RATE {
         return Ok(());
     }
-    Err(Error::input(format!("the {name} is {value}")).remedy(format!("Give a number above 0, at most {MAX_RATE}.")))
+    Err(Error::input(format!("invalid {name} {value}")).remedy(format!("Give a number above 0, at most {MAX_RATE}.")))
 }
 
 #[cfg(test)]

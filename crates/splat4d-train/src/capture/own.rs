@@ -1,4 +1,4 @@
-//! Our own `capture.json`: what a user with a rig writes by hand. docs/capture-format.md is its specification.
+//! splat4d's own `capture.json`, which users with a rig write by hand. Specification: docs/capture-format.md.
 
 use super::account::Account;
 use super::convention::Convention;
@@ -140,8 +140,8 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
 
 /// Whether the part that is needed can be read alone: of fixed cameras, which are held out as a whole or not at all.
 /// The rest can only be determined from the whole.
-fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
-    let by_camera = match told {
+fn in_part(top: &Node<'_>, nodes: &[Node<'_>], stated: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
+    let by_camera = match stated {
         None => nodes.len() > 1,
         Some(rule) => !matches!(rule, HoldOut::Every(_)),
     };
@@ -384,16 +384,16 @@ impl Depth {
         };
         let scale = of("depth_scale")?.map(|n| n.number()).transpose()?;
         if let Some(scale) = scale.filter(|s| *s <= 0.0) {
-            return Err(camera.error(format!("depth_scale is {scale}")).remedy("Give a positive number."));
+            return Err(camera.error(format!("invalid depth_scale {scale}")).remedy("Give a positive number."));
         }
         let whole = match &files {
             Files::Pattern { after, .. } => after.to_ascii_lowercase().ends_with(".png"),
             Files::List(names) => names.iter().any(|n| n.to_ascii_lowercase().ends_with(".png")),
         };
         if scale.is_none() && whole && kind == DepthKind::Metric {
-            return Err(camera
-                .error("\"depth\" refers to integer images without a unit")
-                .remedy("Give \"depth_scale\": scene units a number, for instance 0.001 for millimetres in metres."));
+            return Err(camera.error("\"depth\" refers to integer images without a unit").remedy(
+                "Give \"depth_scale\": scene units per stored number, for instance 0.001 for millimetres in metres.",
+            ));
         }
         Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
     }

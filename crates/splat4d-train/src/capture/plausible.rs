@@ -1,5 +1,5 @@
-//! Whether intrinsics and lenses can be those of the images: principal point, field of view, bend. Cheap: opens no
-//! image.
+//! Whether intrinsics and lenses can be those of the images: principal point, field of view, distortion. Cheap: opens
+//! no image.
 
 use super::account::Aspect;
 use super::account::Severity;

@@ -66,11 +66,11 @@ fn nearest_rotation(mut r: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
 pub(super) fn check_intrinsics(k: &Intrinsics, width: usize, height: usize) -> Result<()> {
     let [fx, fy] = [k.fx, k.fy];
     if ![fx, fy].iter().all(|f| FOCAL.contains(f)) {
-        return Err(Error::input(format!("the focal length is {} x {}", short(fx), short(fy)))
+        return Err(Error::input(format!("invalid focal length {} x {}", short(fx), short(fy)))
             .remedy("Give focal lengths in pixels, above zero."));
     }
     if ![k.cx, k.cy].iter().all(|c| c.abs() <= *FOCAL.end()) {
-        return Err(Error::input(format!("the principal point is {} {}", short(k.cx), short(k.cy)))
+        return Err(Error::input(format!("invalid principal point {} {}", short(k.cx), short(k.cy)))
             .remedy("Give it in pixels; the middle of the image is width/2, height/2."));
     }
     check_size(width, height)

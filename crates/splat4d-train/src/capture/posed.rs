@@ -58,7 +58,7 @@ fn of_images(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
     let naming = rig::naming(&names);
     let mut out: Vec<PosedCamera> = Vec::new();
     for ((path, camera), (number, _)) in shots.iter().zip(&naming.frames) {
-        let name = if naming.told { naming.cameras[*number].clone() } else { stem(path).to_owned() };
+        let name = if naming.stated { naming.cameras[*number].clone() } else { stem(path).to_owned() };
         match out.iter().find(|c| c.name == name) {
             None => out.push(PosedCamera { name, camera: camera.clone() }),
             Some(known) if alike(&known.camera, camera) => {}

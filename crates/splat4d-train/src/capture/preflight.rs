@@ -1,4 +1,4 @@
-//! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
+//! Checks of a capture before training: few cameras, narrow coverage, uneven timestamps.
 
 use super::account::{Severity, first_names};
 use super::{Aspect, Capture, Frame};
@@ -8,7 +8,7 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 /// Something about a capture that will show in the result.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
     /// Related remark of reading the capture; `None`: of something else.
     pub aspect: Option<Aspect>,
@@ -42,7 +42,7 @@ const REACH_DISTANCE: [f64; 2] = [0.5, 2.0];
 /// Training views that determine the reach, at most, evenly chosen.
 const REACH_VIEWS: usize = 200;
 
-/// How far from the training cameras new views will hold: a rule, not a measurement.
+/// Range around the training cameras in which new views are reliable: a rule, not a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reach {
     /// The common target of the cameras.
@@ -56,7 +56,7 @@ pub struct Reach {
 }
 
 impl Capture {
-    /// How far from the training cameras new views will hold; `None`: there is one camera alone.
+    /// Range around the training cameras in which new views are reliable; `None`: there is only one camera.
     pub fn reach(&self) -> Option<Reach> {
         let all = self.training_views();
         let views: Vec<&Frame> = all.iter().step_by(all.len().div_ceil(REACH_VIEWS).max(1)).copied().collect();

@@ -84,7 +84,7 @@ pub(super) struct Naming {
     /// For each image its camera and its frame number, counted from the smallest.
     pub frames: Vec<(usize, usize)>,
     /// Whether the names separate cameras (`cam/frame`, `cam_frameN`), or all belong to one.
-    pub told: bool,
+    pub stated: bool,
     /// The place of each image among those of its camera, where no camera's numbers reach into those of another.
     pub ranks: Option<Vec<usize>>,
 }
@@ -115,8 +115,8 @@ fn camera_of(name: &str) -> Option<&str> {
 
 /// Finds cameras and frame numbers in image names. Where names carry no usable numbers, their order counts.
 pub(super) fn naming(names: &[&str]) -> Naming {
-    let told = !names.is_empty() && names.iter().all(|n| camera_of(n).is_some());
-    let camera = |n: &str| if told { camera_of(n).unwrap_or_default().to_string() } else { "moving".to_string() };
+    let stated = !names.is_empty() && names.iter().all(|n| camera_of(n).is_some());
+    let camera = |n: &str| if stated { camera_of(n).unwrap_or_default().to_string() } else { "moving".to_string() };
     let mut groups: BTreeMap<String, Vec<usize>> = BTreeMap::new();
     for (i, name) in names.iter().enumerate() {
         groups.entry(camera(name)).or_default().push(i);
@@ -146,7 +146,7 @@ pub(super) fn naming(names: &[&str]) -> Naming {
             frames[i] = (c, numbers[i].filter(|_| distinct).map_or(rank, |n| n - first));
         }
     }
-    Naming { cameras: groups.into_keys().collect(), frames, told, ranks: apart.then_some(ranks) }
+    Naming { cameras: groups.into_keys().collect(), frames, stated, ranks: apart.then_some(ranks) }
 }
 
 #[cfg(test)]
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn names_give_cameras_and_frames() {
         let n = naming(&["cam02/0007.png", "images/cam01/0005.jpg", "cam01/images/0006.png"]);
-        assert_eq!((n.cameras.as_slice(), n.told), (&["cam01".to_string(), "cam02".into()][..], true));
+        assert_eq!((n.cameras.as_slice(), n.stated), (&["cam01".to_string(), "cam02".into()][..], true));
         assert_eq!(n.frames, [(1, 2), (0, 0), (0, 1)]);
         let n = naming(&["cam01_frame000003.jpg", "cam02_frame_000004.jpg"]);
         assert_eq!(
@@ -164,7 +164,7 @@ mod tests {
             (&["cam01".to_string(), "cam02".into()][..], vec![(0, 0), (1, 1)])
         );
         let n = naming(&["images/IMG_12.jpg", "images/IMG_10.jpg"]);
-        assert_eq!((n.cameras.len(), n.told, n.frames), (1, false, vec![(0, 2), (0, 0)]));
+        assert_eq!((n.cameras.len(), n.stated, n.frames), (1, false, vec![(0, 2), (0, 0)]));
         let n = naming(&["b.png", "a.png"]);
         assert_eq!(n.frames, [(0, 1), (0, 0)]);
         let n = naming(&["1700000000500.png", "1700009000000.png"]);

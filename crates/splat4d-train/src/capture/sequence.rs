@@ -1,5 +1,4 @@
-//! Cameras and frame numbers of images that carry no information about time: one time, or the frames of films, by their
-//! names.
+//! Cameras and frame numbers of images without timestamps: photos of one time, or frames of videos, by their names.
 
 use super::{Sequence, rig};
 use splat4d::math::Se3;
@@ -53,7 +52,7 @@ pub(super) fn order(
     notes: &mut Vec<String>,
 ) -> FrameOrder {
     let naming = rig::naming(names);
-    let rig = naming.told && naming.cameras.len() > 1;
+    let rig = naming.stated && naming.cameras.len() > 1;
     let mut groups = vec![Vec::new(); naming.cameras.len()];
     naming.frames.iter().enumerate().for_each(|(i, f)| groups[f.0].push(i));
     let one_each = rig && naming.cameras.len() == names.len();

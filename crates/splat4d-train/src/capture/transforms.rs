@@ -56,8 +56,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         }
     }
     let rate = clock::Rate { fps: first.fps, stated: first.stated };
-    let (order, fps) = match clock::told(&entries, rate, options, several, &mut account) {
-        Some(told) => told,
+    let (order, fps) = match clock::read_times(&entries, rate, options, several, &mut account) {
+        Some(read) => read,
         None => (untimed(&entries, options, several, (&mut warnings, &mut notes), first.fps), first.fps),
     };
     let FrameOrder { cameras, frames: places, named, timing } = order;
@@ -69,8 +69,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         ..RawFrame::new(place, entry.source, entry.image)
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();
-    let (file, told) = first.points.unzip();
-    let points = match told {
+    let (file, stated) = first.points.unzip();
+    let points = match stated {
         Some(points) => Some(points),
         None => colmap::companion_points(root, marker, &frames, &mut warnings, &mut notes),
     };

@@ -1,5 +1,5 @@
-//! Compression: a trained scene loses its least important Gaussians, becomes a playback file, and is fine-tuned as that
-//! file.
+//! Compression: removes the least important Gaussians of a trained scene, writes it as a playback file, and fine-tunes
+//! it through that file's quantisation.
 //!
 //! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et
 //!    al. 2025).
@@ -28,6 +28,7 @@ use crate::recipe::Recipe;
 use crate::run::{Outcome, TrainOptions};
 use crate::run::{Refine, refine};
 use crate::run::{plan, training_frames};
+use crate::train_state::{EXPOSURE_COLUMNS, Exposure};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages, feature_ranges};
@@ -49,16 +50,18 @@ pub struct Job<'a> {
     pub source: &'a Scene<f32>,
     /// The capture it was trained on.
     pub capture: Arc<Capture>,
-    /// How it was trained.
+    /// Record of its training.
     pub recipe: &'a Recipe,
     /// The settings of compression.
     pub settings: &'a Compression,
+    /// What the cameras of the capture's frames do to colours, as the scene's run learnt it ([`crate::run::corrected::exposures`]); empty: nothing.
+    pub exposures: &'a [[f32; EXPOSURE_COLUMNS]],
 }
 
 /// The result of a compression.
 #[derive(Debug)]
 pub struct Compressed {
-    /// How the run ended.
+    /// End of the run.
     pub outcome: Outcome,
     /// The file to write, once the last step is done; none where the settings have no codec.
     pub pages: Option<Pages>,
@@ -92,7 +95,7 @@ pub fn compress(
             stages,
             frames: training_frames(job.capture.clone(), job.recipe)?,
             recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
-            exposure: None,
+            exposure: (!job.exposures.is_empty()).then(|| Exposure::learnt(&job.capture, job.exposures)),
             identity: job.settings.to_toml(),
             budget: None,
         },

@@ -40,7 +40,7 @@ impl Prepared {
         if self.plan.common.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
 
-    /// How the settings score Gaussians. Errors: names that are none.
+    /// Scoring by the settings. Errors: unknown names.
     pub(super) fn score_config(&self) -> Result<ScoreConfig> {
         let s = &self.settings;
         Ok(ScoreConfig {

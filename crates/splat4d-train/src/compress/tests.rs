@@ -22,7 +22,13 @@ impl Bed {
     }
 
     fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
-        Job { source: &self.source, capture: self.place.open(&self.recipe), recipe: &self.recipe, settings }
+        Job {
+            source: &self.source,
+            capture: self.place.open(&self.recipe),
+            recipe: &self.recipe,
+            settings,
+            exposures: &[],
+        }
     }
 
     fn compress(&self, name: &str, settings: &Compression) -> (Compressed, Scene<f32>) {

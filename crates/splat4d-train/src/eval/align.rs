@@ -1,5 +1,5 @@
-//! Alignment of views that were held out: their poses and clocks alone are fitted to an unchanged scene, so that a
-//! scene whose cameras were refined is not judged by where the others' stated poses are.
+//! Alignment of held-out views: only their poses and time offsets are fitted to the fixed scene. Otherwise a scene with
+//! refined training cameras would be scored at unrefined held-out poses.
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
@@ -24,7 +24,7 @@ const DSSIM: f64 = 0.0;
 /// Searches of a clock before its gradients are followed: far, then near ([`Corrections::search`]).
 const SEARCHES: [usize; 2] = [0, usize::MAX];
 
-/// How held-out views are aligned.
+/// Alignment of held-out views.
 #[derive(Clone, Debug)]
 pub struct Align {
     settings: RefineSettings,
@@ -50,7 +50,7 @@ impl Align {
         store: &Arc<ImageStore>,
         frames: &[usize],
         backend: &mut dyn Backend,
-        told: &mut dyn FnMut(usize, usize),
+        report_progress: &mut dyn FnMut(usize, usize),
     ) -> Result<(Capture, Value)> {
         let info = |f: usize| &capture.frames[f];
         let fixed = |f: usize| capture.cameras[info(f).camera].fixed;
@@ -110,7 +110,7 @@ impl Align {
                 found.step(&[place], &report.grads(), progress, 1.0);
                 grads.iter_mut().zip(&scene.layers).for_each(|(d, layer)| d.clear(&layer.params));
             }
-            told(done + 1, groups.len());
+            report_progress(done + 1, groups.len());
         }
         let mut aligned = capture.clone();
         for (place, &f) in frames.iter().enumerate() {

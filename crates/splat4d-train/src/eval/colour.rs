@@ -1,9 +1,9 @@
-//! How much of an error is a camera's colour alone: an affine colour matrix fitted a camera, render to truth.
+//! Measures how much of an error is colour: fits an affine colour matrix for each camera, render to truth.
 //!
 //! A view is a handful of sums (the normal equations of the fit), whatever its size; the squared error after any such
-//! matrix is a quadratic form of them. So no image is examined twice, and a camera of a thousand views costs some 200
-//! bytes each. What the matrix makes of a render is not clamped again, which sums could not do: the true error is never
-//! above the given one, since the truth is in `[0,1]`.
+//! matrix is a quadratic form of them. So no image is read twice, and each view needs about 200 bytes. What the matrix
+//! makes of a render is not clamped again, which sums could not do: the true error is never above the given one, since
+//! the truth is in `[0,1]`.
 
 use splat4d::math::cholesky::Cholesky;
 use splat4d::scene::Planes;
@@ -160,12 +160,12 @@ mod tests {
         }
         // The error of a view as it is defined: on the corrected image itself.
         for ((view, truth), sums) in views.iter().zip(&truths).zip(&sums) {
-            let (told, drawn) = (sums.psnr(&found).unwrap(), psnr(&cast(view, &found), truth).unwrap());
-            assert!((told - drawn).abs() < 1e-3, "{told} told, {drawn} drawn");
+            let (computed, drawn) = (sums.psnr(&found).unwrap(), psnr(&cast(view, &found), truth).unwrap());
+            assert!((computed - drawn).abs() < 1e-3, "{computed} computed, {drawn} drawn");
             let plain = psnr(view, truth).unwrap();
-            assert!((sums.psnr(&IDENTITY).unwrap() - plain).abs() < 1e-6 && told > plain + 10.0);
+            assert!((sums.psnr(&IDENTITY).unwrap() - plain).abs() < 1e-6 && computed > plain + 10.0);
             // The best matrix for both views is not the best for one.
-            assert!(sums.psnr(&sums.fit().unwrap()) >= Some(told));
+            assert!(sums.psnr(&sums.fit().unwrap()) >= Some(computed));
         }
     }
 

@@ -89,7 +89,7 @@ impl Judged {
 }
 
 /// Of every Gaussian what the images show about it: those of `train`, which is a list of numbers of `frames`, and those
-/// that were held out. `told`: images done, and all.
+/// that were held out. `progress`: images done, and all.
 ///
 /// Errors: an image that cannot be read; no held-out images; a scene with a pixel head.
 pub fn support(
@@ -98,7 +98,7 @@ pub fn support(
     train: &[usize],
     held: &[usize],
     antialias: bool,
-    told: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Judged> {
     scene.without_head("the search for floaters")?;
     if held.is_empty() {
@@ -117,7 +117,7 @@ pub fn support(
         for &frame in own {
             error += judge.add(frames, frame, &mut sums)?;
             done += 1;
-            told(done, total);
+            progress(done, total);
         }
         if !is_held {
             errors.push(error);
@@ -319,8 +319,8 @@ mod tests {
             let keep = (0..s.len()).map(|i| i != row);
             let edit = splat4d::scene::RowEdit::prune(splat4d::scene::Space::Gaussians, keep);
             without.layers[0].edit(&edit, &Rng::new(0, "x", 0));
-            let (told, is) = (sums[0][row][0], error(&without) - whole);
-            assert!((told - is).abs() < 0.03 * sums[0][row][1] + 0.02, "row {row}: {told}, is {is}");
+            let (predicted, is) = (sums[0][row][0], error(&without) - whole);
+            assert!((predicted - is).abs() < 0.03 * sums[0][row][1] + 0.02, "row {row}: {predicted}, is {is}");
             tried += 1;
         }
         assert!(tried > 5, "{tried} Gaussians were tried");
@@ -331,11 +331,11 @@ mod tests {
         let (rig, s) = (rig(), scene(true));
         // Camera 5 and 11 are held out; 0 and 1 have the veil.
         let train: Vec<usize> = (0..12).filter(|i| i % 6 != 5).collect();
-        let told = support(&s, &rig, &train, &[5, 11], false, &mut |_, _| {}).unwrap();
-        assert!(told.support[0].iter().any(|s| s.seen > 0), "something is seen");
-        assert!(told.floaters(0.0)[0].iter().all(|f| !f), "nothing is found at no strength");
+        let measured = support(&s, &rig, &train, &[5, 11], false, &mut |_, _| {}).unwrap();
+        assert!(measured.support[0].iter().any(|s| s.seen > 0), "something is seen");
+        assert!(measured.floaters(0.0)[0].iter().all(|f| !f), "nothing is found at no strength");
         // The rest is the truth: of it hardly anything may go.
-        let found = told.floaters(0.5).remove(0);
+        let found = measured.floaters(0.5).remove(0);
         let count = |rows: std::ops::Range<usize>| found[rows].iter().filter(|f| **f).count();
         let (veil, rest) = (count(BODY..BODY + VEIL), count(0..BODY));
         // In so dense a veil of one colour each hides that the others are wrong.

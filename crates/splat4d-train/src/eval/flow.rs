@@ -1,4 +1,4 @@
-//! End-point errors of rendered flow against the flow that a capture brings along (`flow` in capture.json), in pixels.
+//! End-point errors of rendered flow against the flow files of a capture (`flow` in capture.json), in pixels.
 
 use crate::Result;
 use crate::capture::Capture;
@@ -16,7 +16,7 @@ const MOVES: f32 = 0.5;
 /// End-point errors within which a pixel counts as right, pixels.
 pub(crate) const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 
-/// How well rendered flow agrees with known flow.
+/// Agreement of rendered with known flow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlowError {
     /// Images that were measured.

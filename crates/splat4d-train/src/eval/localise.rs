@@ -49,7 +49,7 @@ pub const SURE: f64 = 1.0 / 3.0;
 /// The query.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Query {
-    /// How the scene is rendered.
+    /// Settings of the renderer.
     pub antialias: Antialias,
     /// Whether the focal length is searched for too.
     pub lens: bool,
@@ -100,7 +100,7 @@ struct Search<'a> {
     lens: bool,
 }
 
-/// Finds an image ([3, h, w]) in a scene, from the nearest of some cameras of the image's size. `told`: candidates
+/// Finds an image ([3, h, w]) in a scene, from the nearest of some cameras of the image's size. `progress`: candidates
 /// that were
 /// followed, and all.
 ///
@@ -110,7 +110,7 @@ pub fn localise(
     picture: &Planes<f32>,
     starts: &[Camera],
     query: Query,
-    told: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
     assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
@@ -127,7 +127,7 @@ pub fn localise(
         for candidate in &mut candidates {
             search.follow(candidate, &small, times)?;
             done += 1;
-            told(done, all);
+            progress(done, all);
         }
         candidates.sort_by(|a, b| a.cost.total_cmp(&b.cost));
         chance = plainness(&small);

@@ -36,7 +36,7 @@ pub(crate) enum Net {
     Vgg,
 }
 
-/// How values in `[0,1]` enter the network.
+/// Scaling of values in `[0,1]` for the network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InputScaling {
     /// Mapped to `[−1,1]` first, as the `lpips` package requires.

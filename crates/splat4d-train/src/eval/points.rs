@@ -25,7 +25,7 @@ pub(crate) const SHARES: [f64; 5] = [0.01, 0.02, 0.04, 0.08, 0.16];
 /// Cameras, at most: the held-out ones, or where there are none the first of training.
 const CAMERAS: usize = 4;
 
-/// How well points are followed.
+/// Accuracy of followed points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PointErrors {
     /// Points.
@@ -43,7 +43,7 @@ pub struct PointErrors {
     pub pictures: Option<PixelErrors>,
 }
 
-/// How well points are followed in images.
+/// Accuracy of followed points in images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelErrors {
     /// Cameras used.

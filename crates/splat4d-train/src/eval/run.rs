@@ -27,6 +27,7 @@ use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split,
 use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
+use crate::train_state::{EXPOSURE_COLUMNS, expose};
 use crate::{Error, ErrorKind, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -102,6 +103,8 @@ pub struct EvalOptions {
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
+    /// What the capture's cameras do to the colours, frame by frame ([`crate::run::corrected::exposures`]); empty: nothing.
+    pub exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
     /// The renderer; the metrics are the CPU's.
     pub device: Device,
 }
@@ -117,6 +120,7 @@ impl Default for EvalOptions {
             measured: Measured::Test,
             place: None,
             align: None,
+            exposures: Vec::new(),
             device: Device::Cpu,
         }
     }
@@ -247,6 +251,7 @@ struct Judge<'a> {
     capture: &'a Capture,
     store: &'a Arc<ImageStore>,
     lpips: Option<Lpips>,
+    exposures: &'a [[f32; EXPOSURE_COLUMNS]],
     stop: &'a AtomicBool,
     backend: Box<dyn Backend>,
     /// It in words.
@@ -263,7 +268,7 @@ impl<'a> Judge<'a> {
         capture: &'a Capture,
         store: &'a Arc<ImageStore>,
         lpips: Option<Lpips>,
-        options: &EvalOptions,
+        options: &'a EvalOptions,
         stop: &'a AtomicBool,
         listen: &mut dyn FnMut(&Event),
     ) -> Self {
@@ -282,6 +287,7 @@ impl<'a> Judge<'a> {
             capture,
             store,
             lpips,
+            exposures: &options.exposures,
             stop,
             backend,
             device: if on_cpu { DEVICE.into() } else { name },
@@ -353,9 +359,10 @@ impl<'a> Judge<'a> {
         split: &mut Split,
         listen: &mut dyn FnMut(&Event),
     ) -> Result<Value> {
-        let mut told = |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
+        let mut progress =
+            |done, total| listen(&Event::Phase { name: "aligning held-out cameras".into(), done, total });
         let (scene, store, backend) = (self.scene, self.store, self.backend.as_mut());
-        let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut told)?;
+        let (capture, report) = align.fit(scene, self.capture, store, frames, backend, &mut progress)?;
         for camera in cameras(&capture, frames) {
             let fixed = capture.cameras[camera.id].fixed && camera.places.len() > 1;
             let mean = if fixed { Some(self.temporal_mean(frames, &camera.places)?) } else { None };
@@ -391,6 +398,9 @@ impl<'a> Judge<'a> {
         let splats = self.scene.splats(&self.instant);
         self.backend.render(&Shot::new(&splats, &info.view, self.scene.background), &mut self.image)?;
         let mut image = self.image.color.clone();
+        if let Some(row) = self.exposures.get(frame) {
+            expose(row, &mut image);
+        }
         let mut known = Planes::default();
         let known = stored.valid_into(&mut known).then_some(&known);
         let sums = ColourSums::of(&image, &truth, known);

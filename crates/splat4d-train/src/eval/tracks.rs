@@ -25,7 +25,7 @@ const LEAST_OPACITY: f64 = 0.5;
 /// Seconds by which times of one frame may differ for rounding.
 const CLOCK_ERROR: f64 = 1e-4;
 
-/// How well surfaces are followed.
+/// Accuracy of followed surfaces.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrackError {
     /// Points that were followed.

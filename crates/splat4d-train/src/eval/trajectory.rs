@@ -12,7 +12,7 @@ use std::path::Path;
 /// Fewest cameras that determine more than the similarity that is taken away.
 const FEWEST: usize = 3;
 
-/// How far the cameras of a capture are from their truth.
+/// Errors of a capture's cameras against the truth.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryError {
     /// The names of the poses: camera, and the number of the image where the camera moves.

@@ -1,4 +1,5 @@
-//! Points between the points: if a capture has few, every camera sees surfaces that continue from one to the next.
+//! Adds points between the initial points where a capture has few, on the assumption that surfaces continue between
+//! them.
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls
 //! settle wherever the training cameras cannot see them, as haze in front of views that were not trained on. Here every

@@ -31,7 +31,7 @@ pub struct Seeds {
     pub colors: Vec<[f32; 3]>,
     /// When the point was seen, seconds; `None`: during the whole clip.
     pub times: Vec<Option<f64>>,
-    /// How fast it moves, scene units per second; zero where unknown.
+    /// Velocity, scene units per second; zero where unknown.
     pub velocities: Vec<[f64; 3]>,
     /// Width of the lifespans of points with a time, seconds; `None`: the recipe's.
     pub life: Option<f64>,

@@ -1,5 +1,4 @@
-//! How fast what a depth map shows moves: optical flow to the images before and after, and the depth at both of its
-//! ends.
+//! Velocities of depth map pixels: optical flow to the images before and after, and the depth at both ends of the flow.
 
 use super::map::Map;
 use crate::Result;

@@ -19,7 +19,7 @@ const DIRECTIONS: usize = 8;
 pub struct Feature {
     /// Pixel position in the image.
     pub pixel: [f64; 2],
-    /// How much it differs from what is around it.
+    /// Contrast to its surroundings.
     pub contrast: f32,
     /// Its descriptor.
     pub descriptor: [u8; NUMBERS],
@@ -63,7 +63,7 @@ const DOUBLED_BELOW: usize = 500_000;
 /// Features of an image where nothing else is reported, at most: those of highest contrast.
 const MOST: usize = 3000;
 
-/// How many features are searched for.
+/// Number of features to find.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     /// Least contrast of an extremum, of an image in [0, 1].

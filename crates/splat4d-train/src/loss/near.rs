@@ -1,4 +1,4 @@
-//! Nearest neighbours, cached from step to step: they change slowly, and searching them is dear.
+//! Nearest neighbours, cached from step to step: they change slowly, and the search is expensive.
 
 use splat4d::math::Real;
 use splat4d::math::knn::knn;

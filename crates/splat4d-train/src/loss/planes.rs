@@ -17,7 +17,7 @@ use splat4d::nn::hexplane::{PlaneShape, SPATIAL, TEMPORAL};
 use splat4d::scene::{Grads, Key, Params};
 use splat4d::simd::{Pass, Simd, dispatch_pass};
 
-/// How strong; each is a factor of a mean, 0: none.
+/// Weights; each is a factor of a mean, 0: off.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct PlaneWeights {
     /// Second differences of the spatial planes.

@@ -138,7 +138,7 @@ impl<F: Real> ParamLoss<F> for LivingOpacity {
     }
 
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
-        let lives: Vec<_> = scene.layers.iter().map(|l| l.lives()).collect();
+        let lives: Vec<_> = scene.layers.iter().map(|l| l.lifespans()).collect();
         over_active(scene, d, self.weight, |layer, g, row| {
             let (kind, rows) = &lives[layer];
             let columns = rows[row].map(F::of);

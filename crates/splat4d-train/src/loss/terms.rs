@@ -43,7 +43,7 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
     fn eval(&self, scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64;
     /// Rows were edited: whatever was remembered of rows is stale.
     fn on_edit(&self) {}
-    /// The state for a checkpoint, if it remembers anything from step to step.
+    /// The state for a checkpoint, if it keeps any from step to step.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }
@@ -76,7 +76,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     }
     /// Rows were edited: whatever was remembered of rows is stale.
     fn on_edit(&self) {}
-    /// The state for a checkpoint, if it remembers anything from step to step.
+    /// The state for a checkpoint, if it keeps any from step to step.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }

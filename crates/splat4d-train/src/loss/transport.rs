@@ -1,4 +1,4 @@
-//! Optimal transport over time, on any model: how far Gaussians travel from frame to frame, or how far they leave
+//! Optimal transport over time, for any model: displacement of Gaussians from frame to frame, or deviation from
 //! constant velocity, as distances between Gaussians instead of between parameters.
 //!
 //! | term | value over consecutive frames a, b, c, mean over rows |
@@ -69,7 +69,7 @@ impl Choice for Option<Metric> {
 pub(crate) struct TransportConfig {
     /// The quantities that distances are between.
     pub metric: Metric,
-    /// How shapes continue at constant velocity.
+    /// Prediction of shapes at constant velocity.
     pub predictor: Predictor,
     /// Weight of the temporal term.
     pub temporal: f64,

@@ -4,7 +4,7 @@ use super::Every;
 use crate::settings::{choices, settings};
 
 choices! {
-    /// How Gaussians are added and removed.
+    /// Strategy of density control.
     pub enum Strategy {
         /// Adaptive density control: clone, split, prune.
         Adc = "adc",

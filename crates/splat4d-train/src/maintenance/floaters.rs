@@ -1,8 +1,7 @@
-//! Removal of floaters: Gaussians that hang right before a camera that does not see them, and that one camera alone
-//! sees.
+//! Removal of floaters: Gaussians that at most one camera sees and that are close to another camera.
 //!
-//! One camera's images carry no information about depth, so that Gaussians that it alone sees drift along its rays, and
-//! some of them stay between the other cameras, where they veil every view. Their content is learnt again where others
+//! Images of one camera do not determine depth, so Gaussians that only one camera sees drift along its rays. Some stay
+//! close to other cameras, where they cover every view between the cameras. Their content is learnt again where others
 //! see it, or farther away. A Gaussian in front of the camera that sees it may be correct and is kept, as are those
 //! that two cameras see.
 
@@ -25,7 +24,8 @@ settings! {
         /// Iterations between removals of Gaussians that at most one camera sees and that are close to another one; 0:
         /// never.
         interval: usize = 100 => any().unit("iterations").switch();
-        /// Distance below which a Gaussian is close to a camera that does not see it, of the median viewing distance.
+        /// Distance below which a Gaussian is close to a camera that does not see it, share of the median viewing
+        /// distance.
         distance: f64 = 0.4 => positive();
     }
 }

@@ -113,7 +113,7 @@ impl Maintenance for Guided {
             return Ok(Change::default());
         }
         let mut points = Vec::new();
-        for (k, look) in looks(scene, c.frames, c.antialias, rng.fork(1))?.iter().enumerate() {
+        for (k, look) in errors_of_views(scene, c.frames, c.antialias, rng.fork(1))?.iter().enumerate() {
             let most = budget * (k + 1) / WORST_VIEWS;
             rays(look, c.frames, most.saturating_sub(points.len()), rng.fork(2 + k as u64), &mut points);
         }
@@ -148,7 +148,7 @@ impl Maintenance for Guided {
 }
 
 /// The worst of some views, evenly chosen with a random start.
-fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<ViewError>> {
+fn errors_of_views(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<ViewError>> {
     let mut backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
     let mut worst: Vec<ViewError> = Vec::new();

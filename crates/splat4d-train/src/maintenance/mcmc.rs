@@ -1,5 +1,5 @@
 //! Densification as Markov chain Monte Carlo: dead Gaussians are moved onto live ones so that the image stays the same,
-//! the cloud grows by 5 % a time up to the cap, and positions are shaken while a Gaussian is nearly transparent.
+//! the cloud grows by 5 % a time up to the cap, and positions get noise while a Gaussian is nearly transparent.
 //!
 //! Their targets are drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its lifespan with
 //! it.

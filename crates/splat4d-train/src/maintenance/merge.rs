@@ -1,5 +1,5 @@
-//! Too many Gaussians in one place: near pairs are merged, or the fainter of a pair is removed (spatial-proximity
-//! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
+//! Merging of Gaussians at one position: near pairs are merged, or the fainter of a pair is removed (spatial-proximity
+//! pruning). Pairs are mutual nearest neighbours, so each row is in at most one pair.
 
 use super::{At, Change, Context, Maintenance, RunOrder, covariances, logit, opacity};
 use crate::Result;
@@ -33,7 +33,7 @@ settings! {
         pair: Pair = Pair::None => any().switch();
         /// Iterations between two searches for such pairs; 0: never.
         interval: usize = 500 => any().unit("iterations");
-        /// Largest distance of such a pair, of the smaller one's standard deviation.
+        /// Largest distance of such a pair, share of the smaller one's standard deviation.
         distance: f64 = 0.3;
     }
 }

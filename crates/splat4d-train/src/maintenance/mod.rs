@@ -143,7 +143,7 @@ impl Every {
     }
 }
 
-/// How many rows were born and died.
+/// Numbers of added and removed rows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Change {
     /// New rows.
@@ -254,7 +254,7 @@ pub trait Maintenance: Send + Sync {
         false
     }
 
-    /// The state for a checkpoint, if it remembers anything from time to time.
+    /// The state for a checkpoint, if it keeps any.
     fn state(&self) -> Vec<u32> {
         Vec::new()
     }

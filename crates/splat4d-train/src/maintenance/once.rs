@@ -1,5 +1,5 @@
-//! Once: a change of the scene in the middle of a stage, whose schedules continue: a filter that is switched on, a
-//! model that becomes another.
+//! One-time change of the scene in the middle of a stage, whose schedules continue: switching on a filter, replacing a
+//! model.
 
 use super::{At, Change, Context, Maintenance};
 use crate::Result;

@@ -1,5 +1,5 @@
-//! Opacity reset: every n steps all opacities are lowered, so that Gaussians that images do not need stay faint and are
-//! pruned. Source: Kerbl et al. 2023 §5.2.
+//! Opacity reset: every n steps all opacities are lowered, so that superfluous Gaussians stay faint and are pruned.
+//! Source: Kerbl et al. 2023 §5.2.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, Strategy, logit};
 use crate::Result;
@@ -24,7 +24,7 @@ settings! {
 /// Lowers opacities while the cloud is densified by gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct OpacityReset {
-    /// How often.
+    /// Interval.
     pub settings: OpacityResetSettings,
     /// When the cloud is densified: nothing is reset at the last time or after it.
     pub densification: Every,

@@ -1,5 +1,5 @@
-//! Periodic relocation, next to any strategy: the faintest Gaussians are moved to where the image still changes, a few
-//! at a time, so that none is wasted, also after densification has ended.
+//! Periodic relocation, next to any strategy: the faintest Gaussians are moved to positions with large image gradients,
+//! a few at a time, also after densification has ended.
 //!
 //! Source: Wang et al. 2025 (FreeTimeGS) §3.3: every 100 steps, below a threshold of opacity, to positions drawn from ½
 //! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).

@@ -1,6 +1,6 @@
-//! The static/dynamic split: late in training, Gaussians that turned out not to move become a layer of their own that
-//! cannot (as in Swift4D, Wu et al. 2025, and Ex4DGS, Lee et al. 2024). They are then free to play, cannot flicker, and
-//! what is left for the motion model is what moves.
+//! The static/dynamic split: late in training, Gaussians that hardly move become a static layer (as in Swift4D, Wu et
+//! al. 2025, and Ex4DGS, Lee et al. 2024). They then cost no motion in playback and cannot flicker, and the motion
+//! model keeps the moving ones only.
 
 use super::{At, Change, Context, Maintenance};
 use crate::Result;
@@ -107,7 +107,7 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
         (0..TIMES).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (TIMES - 1) as f64)).collect();
     let look = |t: Time| Evaluation::of_layer(layer, Space::Gaussians, Rows::All, t);
     let middle = look(times[TIMES / 2]);
-    let (kind, lives) = layer.lives();
+    let (kind, lives) = layer.lifespans();
     for t in times {
         let now = look(t);
         for (row, still) in still.iter_mut().enumerate() {

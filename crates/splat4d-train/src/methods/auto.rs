@@ -57,9 +57,9 @@ impl CaptureStats {
         self.times >= LONG
     }
 
-    /// The cameras that see a time, in words.
+    /// The cameras that record a frame, in words.
     pub(crate) fn cameras_in_words(&self) -> String {
-        if self.cameras < 1.5 { "one camera sees".to_owned() } else { format!("{:.1} cameras see", self.cameras) }
+        if self.cameras < 1.5 { "one camera records".to_owned() } else { format!("{:.1} cameras record", self.cameras) }
     }
 }
 

@@ -13,12 +13,11 @@ settings! {
         sh_degree: usize = 2 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
-        /// Learn a colour matrix and an offset per camera, if there are several cameras and each is named or has
-        /// several images; their mean stays the identity.
+        /// Learn a colour matrix and an offset per camera, if there are several; their mean stays the identity.
         exposure: bool = true;
-        /// The same for photos with automatic exposure: colours between them become more accurate, except those of
-        /// held-out photos (studies/records/2026-11-26-recipe-trials.md).
-        exposure_single: bool = false => any().when(On("appearance.exposure"));
+        /// The same for photos, each of which is a camera with its own automatic exposure. A held-out photo has the mean of the photos
+        /// before and after it, as far as neighbours are alike.
+        exposure_single: bool = true => any().when(On("appearance.exposure"));
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
         /// Antialiased mode (opacity compensation).
@@ -29,11 +28,11 @@ settings! {
 settings! {
     /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
-        /// Rate of positions at the start, of the extent; 0: 0.001, and less in proportion if `densify.max_cap` is above
-        /// 60,000.
+        /// Rate of positions at the start, share of the extent; 0: 0.001, and less in proportion if `densify.max_cap`
+        /// is above 60,000.
         position_init: f64 = 0.0 => any().unit("extents");
-        /// Rate of positions at the end, of the extent; 0: 0.0001, and less in proportion if `densify.max_cap` is above
-        /// 30,000.
+        /// Rate of positions at the end, share of the extent; 0: 0.0001, and less in proportion if `densify.max_cap` is
+        /// above 30,000.
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();

@@ -136,7 +136,7 @@ impl Method for ControlMethod {
     fn suits(&self, seen: &CaptureStats) -> Option<String> {
         let one = seen.masks && !seen.is_long();
         one.then(|| {
-            format!("{} each time, and masks show one object: few nodes move all of it", seen.cameras_in_words())
+            format!("{} each frame, and masks show one object: few nodes move all of it", seen.cameras_in_words())
         })
     }
 

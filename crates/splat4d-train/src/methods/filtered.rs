@@ -1,9 +1,9 @@
 //! `filtered`: any program with a temporal filter around its model, and the transport losses on any model.
 //!
 //! The inner program's stages are not changed; the filter is there from the start, switched off, and is switched on in
-//! the middle of whichever stage runs then, so that no schedule notices. Hooks of the inner program see its own model:
-//! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe
-//! states otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
+//! the middle of the stage that runs then, without effect on schedules. Hooks of the inner method get its own model:
+//! the filter is removed around them. At the end the filter is disabled and the network kept, unless the recipe states
+//! otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
 
 use super::{Group, Hook, InitialMotion, Method, Stage, TrainContext};
 use crate::Result;

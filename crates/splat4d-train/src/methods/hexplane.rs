@@ -1,5 +1,5 @@
-//! `hexplane`: how it is learnt. A coarse stage in which nothing moves, then a fine one in which planes and networks
-//! learn with the canonical cloud. The box of the planes is that of the cloud when the fine stage begins.
+//! Training of `hexplane`. A coarse stage in which nothing moves, then a fine one in which planes and networks learn
+//! with the canonical cloud. The box of the planes is that of the cloud when the fine stage begins.
 //!
 //! The original multiplies every rate by the scene's extent. Here the networks' inputs are in the box [0, 1]³ and their
 //! outputs in half boxes, so the rates of planes and networks have no unit; the cloud's positions keep theirs.

@@ -159,7 +159,7 @@ pub struct Group {
     pub column: String,
     /// Columns of the group that it covers (first, count); `None`: all.
     pub part: Option<(usize, usize)>,
-    /// How fast.
+    /// Learning rate.
     pub rate: Rate,
     /// Frozen for this many steps of the stage (networks and fine grids that start later).
     pub from: usize,
@@ -332,7 +332,7 @@ impl Stage {
     }
 }
 
-/// How a Gaussian begins, as far as its seed states it.
+/// Initial lifespan and velocity of a Gaussian, where its seed states them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitialMotion {
     /// Centre and width of its lifespan, seconds.
@@ -341,7 +341,7 @@ pub struct InitialMotion {
     pub velocity: [f64; 3],
 }
 
-/// How one motion model is learnt.
+/// Training method of a motion model.
 pub trait Method: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &TrainContext) -> Spec;

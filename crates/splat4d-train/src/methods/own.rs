@@ -32,12 +32,12 @@ impl OwnMotion {
     /// Errors: a name that is taken or cannot be written; a share outside [0, 1); rates that are not finite.
     pub fn register(self) -> Result<()> {
         if !(0.0..1.0).contains(&self.warmup) {
-            return Err(Error::input(format!("the warm-up of `{}` is {}", self.name, self.warmup))
+            return Err(Error::input(format!("invalid warm-up of `{}`: {}", self.name, self.warmup))
                 .remedy("Give a share of the iterations, from 0 to below 1"));
         }
         let wrong = |r: &Rate| !(r.start.is_finite() && r.end.is_finite() && r.start >= 0.0 && r.end >= 0.0);
         if let Some((column, rate)) = self.rates.iter().find(|(_, r)| wrong(r)) {
-            return Err(Error::input(format!("the rate of `{column}` is {} to {}", rate.start, rate.end))
+            return Err(Error::input(format!("invalid rate of `{column}`: {} to {}", rate.start, rate.end))
                 .remedy("Give rates of 0 or more"));
         }
         register_motion(&self.name, self.make.clone())?;

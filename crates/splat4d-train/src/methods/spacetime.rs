@@ -97,14 +97,14 @@ impl Method for SpacetimeMethod {
         if seen.depth && !seen.masks && !seen.predicted {
             let cameras = seen.cameras_in_words();
             return Some(format!(
-                "{cameras} each time, and depth maps give positions at that time, from which Gaussians start"
+                "{cameras} each frame, and depth maps give positions at that time, from which Gaussians start"
             ));
         }
         let moving =
             seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
         (seen.cameras >= MANY_CAMERAS).then(|| {
             let cameras = seen.cameras;
-            format!("{cameras:.0} cameras see every time{moving}: enough for explicit motion with lifespans")
+            format!("{cameras:.0} cameras record every frame{moving}: enough for explicit motion with lifespans")
         })
     }
 

@@ -1,6 +1,5 @@
-//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and maintenance it shares;
-//! before it, if the recipe specifies it, a still warm-up, after which nodes are placed again on what became of the
-//! cloud.
+//! Training of `ssm`. One joint stage, as of `control`, whose nodes, losses on nodes and maintenance it shares; before
+//! it, if the recipe specifies it, a still warm-up, after which nodes are placed again on what became of the cloud.
 
 use super::{ControlSettings, Group, Hook, Method, Rate, Stage, TrainContext, control, still};
 use crate::maintenance::NodeSettings;

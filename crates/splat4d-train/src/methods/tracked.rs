@@ -1,5 +1,5 @@
-//! `tracked`: how it is learnt. Frame 0 as a still scene; then one stage a frame, in which only that frame's poses
-//! learn, starting from the extrapolation of the previous frames, tied to their neighbours.
+//! Training of `tracked`. Frame 0 as a still scene; then one stage a frame, in which only that frame's poses learn,
+//! starting from the extrapolation of the previous frames, tied to their neighbours.
 //!
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not
 //! given; lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not depend
@@ -38,15 +38,15 @@ settings! {
     when (Is("run.motion", &["tracked"])) {
         /// Share of the iterations that frame 0 gets; the other frames share the rest.
         first_share: f64 = 0.25;
-        /// Rate of a frame's positions at its first step, of the extent.
+        /// Rate of a frame's positions at its first step, share of the extent.
         lr_init: f64 = 3e-3 => any().unit("extents");
-        /// Rate of a frame's positions at its last step, of the extent.
+        /// Rate of a frame's positions at its last step, share of the extent.
         lr_final: f64 = 4e-4 => any().unit("extents");
         /// Rate of a frame's quaternions.
         rotation_lr: f64 = 6e-3;
         /// Rate of base colours after frame 0. Colours are shared, so earlier frames change too.
         feature_lr: f64 = 0.0;
-        /// Longest step that a Gaussian repeats in the next frame, of the extent.
+        /// Longest step that a Gaussian repeats in the next frame, share of the extent.
         velocity_cap: f64 = 0.05 => any().unit("extents");
         /// Number of neighbours that each Gaussian is tied to.
         neighbours: usize = 20;
@@ -113,7 +113,7 @@ impl Method for TrackedMethod {
     fn suits(&self, seen: &CaptureStats) -> Option<String> {
         (seen.predicted && seen.fewest >= LEAST_CAMERAS && !seen.is_long()).then(|| {
             let cameras = seen.cameras_in_words();
-            format!("{cameras} each time, and prediction needs persistent Gaussians that can be tracked")
+            format!("{cameras} each frame, and prediction needs persistent Gaussians that can be tracked")
         })
     }
 
@@ -167,7 +167,7 @@ impl Method for TrackedMethod {
     }
 }
 
-/// Whether Gaussians learn who is foreground.
+/// Whether Gaussians learn a foreground logit.
 fn segments(plan: &TrainContext, tracked: &TrackedSettings) -> bool {
     plan.masks && tracked.seg > 0.0
 }

@@ -1,5 +1,5 @@
-//! Position noise: after every step nearly transparent Gaussians are shaken, so that they find where they are of use.
-//! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3.
+//! Position noise: after every step, positions of nearly transparent Gaussians get noise, so that they explore. Source:
+//! Kheradmand et al. 2024 (3DGS as MCMC) §3.
 
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Real, Rng, sym3};

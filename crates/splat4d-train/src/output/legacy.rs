@@ -1,4 +1,4 @@
-//! Runs of versions that kept no list of their files: what marks one, and which of its files are surely not the user's.
+//! Runs of versions without a file list: their markers, and the files that certainly are not the user's.
 
 use super::STATE;
 use crate::recipe::Recipe;

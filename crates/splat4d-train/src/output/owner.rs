@@ -19,7 +19,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 /// File that is locked; it is empty, and stays.
 const LOCK: &str = "lock";
-/// File that states who has the lock.
+/// File with the owner of the lock.
 const RECORD: &str = "owner.json";
 /// Time between two heartbeats.
 const BEAT: Duration = Duration::from_secs(5);
@@ -91,7 +91,7 @@ pub struct Owner {
     heart: Option<JoinHandle<()>>,
 }
 
-/// How long a dead owner's record is believed, and watched.
+/// Time for which a dead owner's record is accepted, and watched.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patience {
     pub(super) dead: Duration,
@@ -285,7 +285,7 @@ fn is_alive(state: &Path, record: &Path, before: &OwnerRecord, patience: Patienc
     false
 }
 
-/// How long ago, or how far in the future, a file was last written; `None`: unknown.
+/// Time since a file was last written, or until then if it is in the future; `None`: unknown.
 fn age(path: &Path, now: SystemTime) -> Option<Duration> {
     let written = std::fs::metadata(path).and_then(|m| m.modified()).ok()?;
     Some(now.duration_since(written).unwrap_or_else(|future| future.duration()))
@@ -294,9 +294,9 @@ fn age(path: &Path, now: SystemTime) -> Option<Duration> {
 /// Now, by the clock of the folder's machine: clocks of machines differ.
 fn now(state: &Path) -> SystemTime {
     let probe = state.join(format!("now-{}-{:?}", std::process::id(), std::thread::current().id()));
-    let told = std::fs::write(&probe, b"").and_then(|()| std::fs::metadata(&probe)).and_then(|m| m.modified());
+    let stamp = std::fs::write(&probe, b"").and_then(|()| std::fs::metadata(&probe)).and_then(|m| m.modified());
     let _ = std::fs::remove_file(&probe);
-    told.unwrap_or_else(|_| SystemTime::now())
+    stamp.unwrap_or_else(|_| SystemTime::now())
 }
 
 /// Name of this machine, for people.

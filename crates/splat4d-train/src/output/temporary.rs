@@ -1,4 +1,4 @@
-//! Temporary names of files that are being written, and what dead processes left under them.
+//! Temporary names of files that are being written, and removal of those that dead processes left.
 
 use super::list;
 use std::collections::BTreeSet;

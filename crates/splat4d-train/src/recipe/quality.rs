@@ -1,4 +1,4 @@
-//! `--quality`: how much a run is to take, in three words.
+//! `--quality`: presets of steps, Gaussians and image size.
 
 use super::Recipe;
 use crate::{Error, Result};

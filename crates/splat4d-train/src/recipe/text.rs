@@ -1,4 +1,4 @@
-//! Recipes as text: TOML files, `--set key=value`, and what a run's fingerprint is of.
+//! Recipes as text: TOML files, `--set key=value`, and the text that a run's fingerprint hashes.
 
 use super::Recipe;
 use super::flat::FLAT;

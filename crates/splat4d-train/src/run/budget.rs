@@ -1,5 +1,5 @@
-//! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while
-//! runs, the machine may be slower or faster than then, and the remaining steps are planned again.
+//! [`Budget`]: the time limit of a run. Before the first step, timed steps determine the length of the run. If the
+//! machine becomes slower or faster during training, the remaining steps are planned again.
 //!
 //! A new plan is one row of `run.replans` and depends on the clock; all else follows from the rows
 //! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or continues with them gives the same bits.

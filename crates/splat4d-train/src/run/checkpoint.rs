@@ -1,6 +1,6 @@
-//! Checkpoints hold everything: scene, moments, statistics, exposure, corrections of cameras, the memory of
-//! losses, codecs and maintenance, how far the run is. Random
-//! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
+//! Checkpoints store the whole state: scene, moments, statistics, exposure, corrections of cameras, the state of
+//! losses, codecs and maintenance, and the progress of the run. Random numbers and samplers are functions of the step
+//! and need no saving. A resumed run equals an uninterrupted one, bit for bit.
 //!
 //! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of
 //! scenes opens it too.
@@ -218,12 +218,12 @@ fn moments_name(layer: usize, params: &Params<f32>, key: Key) -> String {
     format!("moments.{layer}.{}", params.info(key).name)
 }
 
-/// The array that holds what a stage's loss over several times remembers.
+/// The array that stores the state of a stage's loss over several times.
 fn probe_name(stage: usize, loss: usize) -> String {
     format!("memory.{stage}.probe.{loss}")
 }
 
-/// The array that holds what a stage's operation of maintenance remembers.
+/// The array that stores the state of a stage's maintenance operation.
 fn maintenance_name(stage: usize, operation: &str) -> String {
     format!("upkeep.{stage}.{operation}")
 }

@@ -1,27 +1,80 @@
-//! `refined.json`: what a run has learnt of its capture's cameras, so that measurements of the scene use them.
+//! `refined.json`: corrections of the capture's cameras that a run has learnt. Measurements of the scene apply them.
 
 use super::checkpoint::write_atomically;
-use crate::capture::Capture;
+use crate::capture::{Capture, Frame};
 use crate::step::trainer::Trainer;
-use crate::train_state::{moved, zoomed};
+use crate::train_state::{EXPOSURE_COLUMNS as COLUMNS, TrainState, moved, zoomed};
 use crate::{Error, Result};
-use serde_json::Value;
+use serde_json::{Value, json};
 use splat4d::scene::Time;
 use std::path::Path;
 
 /// The file's name in a run.
 pub(crate) const FILE: &str = "refined.json";
 
-/// Writes the learnt corrections of cameras, if there are any.
+/// Writes the learnt corrections of cameras, and the exposures of photos, if there are any.
 pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Result<()> {
-    let Some(corrections) = &trainer.train_state.corrections else { return Ok(()) };
+    let TrainState { corrections, exposure, .. } = &trainer.train_state;
+    let photos = exposure.as_ref().filter(|_| capture.of_photos());
+    if corrections.is_none() && photos.is_none() {
+        return Ok(());
+    }
     let name = |i: usize| {
         let frame = &capture.frames[capture.train[i]];
         let camera = &capture.cameras[frame.camera];
         (camera.name.clone(), (!camera.fixed).then_some(frame.index))
     };
-    let text = format!("{:#}\n", corrections.report(&name));
-    write_atomically(&run.join(FILE), text.as_bytes())
+    let mut value = match corrections {
+        Some(corrections) => corrections.report(&name),
+        None => json!({ "poses": false, "focal": false, "times": false, "cameras": [] }),
+    };
+    if let Some(exposure) = photos {
+        let row = |&rig: &usize| (capture.cameras[rig].name.clone(), json!(exposure.response(rig)));
+        value["exposures"] = exposure.trained().iter().map(row).collect::<Value>();
+    }
+    write_atomically(&run.join(FILE), format!("{value:#}\n").as_bytes())
+}
+
+/// Exposures of a capture's frames, in its order, each as a colour matrix without the identity and an offset: photos that a run was
+/// trained on have the one that it learnt; others have a share of the mean of their neighbours', because a camera that is carried on meets
+/// similar light. Empty: none was learnt.
+///
+/// Errors: those of [`read`].
+pub fn exposures(capture: &Capture, run: &Path) -> Result<Vec<[f32; COLUMNS]>> {
+    let Some(value) = read(run)? else { return Ok(Vec::new()) };
+    let Some(rows) = value["exposures"].as_object() else { return Ok(Vec::new()) };
+    let learnt = |frame: &Frame| {
+        let row: Vec<f32> = rows
+            .get(&capture.cameras[frame.camera].name)?
+            .as_array()?
+            .iter()
+            .filter_map(Value::as_f64)
+            .map(|x| x as f32)
+            .collect();
+        row.try_into().ok()
+    };
+    Ok(complete(&capture.frames.iter().map(learnt).collect::<Vec<_>>()))
+}
+
+/// Fills gaps by a share of the mean of the nearest rows before and after. The share is the one with which this predicts the known rows best, each
+/// from the others: near 1 where neighbours are alike, 0 where they are not.
+fn complete(rows: &[Option<[f32; COLUMNS]>]) -> Vec<[f32; COLUMNS]> {
+    let mean = |i: usize| {
+        let sides = [rows[..i].iter().rev().flatten().next(), rows[i + 1..].iter().flatten().next()];
+        let known = sides.into_iter().flatten();
+        let count = known.clone().count().max(1) as f32;
+        known.fold([0.0; COLUMNS], |sum, row| std::array::from_fn(|k| sum[k] + row[k] / count))
+    };
+    let dot = |a: &[f32; COLUMNS], b: &[f32; COLUMNS]| a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+    let (mut along, mut length) = (0.0, 0.0);
+    for (i, row) in rows.iter().enumerate() {
+        let Some(row) = row else { continue };
+        let predicted = mean(i);
+        along += dot(&predicted, row);
+        length += dot(&predicted, &predicted);
+    }
+    let share = (along / length.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0) as f32;
+    rows.iter().enumerate().map(|(i, row)| row.unwrap_or_else(|| mean(i).map(|x| share * x))).collect()
 }
 
 /// Learnt corrections of a run's cameras; `None`: it did not learn any. Errors: damage.
@@ -84,4 +137,35 @@ pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Twelve photos in a row, of which the exposure changes slowly: the third and the last were held out.
+    #[test]
+    fn held_out_photos_have_their_neighbours_exposure() {
+        let of = |i: usize| std::array::from_fn(|k| (0.4 * i as f32).sin() * (k + 1) as f32 * 0.01);
+        let learnt: Vec<_> = (0..12).map(|i| (i % 9 != 2).then(|| of(i))).collect();
+        let all = complete(&learnt);
+        for (i, row) in all.iter().enumerate() {
+            for (k, (got, truth)) in row.iter().zip(of(i)).enumerate() {
+                assert!(
+                    if learnt[i].is_some() { *got == truth } else { (got - truth).abs() < 0.02 },
+                    "photo {i}, column {k}: {got}, {truth}"
+                );
+            }
+            assert!(learnt[i].is_some() || (row[11] / of(i)[11] - 1.0).abs() < 0.2, "photo {i}");
+        }
+    }
+
+    #[test]
+    fn neighbours_that_are_not_alike_predict_nothing() {
+        let learnt: Vec<_> =
+            (0..12).map(|i| (i % 5 != 2).then_some([if i % 2 == 0 { 0.1 } else { -0.1 }; COLUMNS])).collect();
+        let all = complete(&learnt);
+        assert_eq!(all[2], [0.0; COLUMNS]);
+        assert_eq!(complete(&[None, None]), vec![[0.0; COLUMNS]; 2], "nothing was learnt");
+    }
 }

@@ -43,9 +43,9 @@ impl OpenCapture {
         let (needed, scale) = (pixels / each(recipe), recipe.densify.count_scale);
         let count = number(needed, steps, scale);
         let of = if share < 1.0 { " of the object" } else { "" };
-        let mut why = format!("{} distinct views show {:.1} megapixels{of}", views.len(), pixels / 1e6);
+        let mut why = format!("{} distinct views show {:.2} megapixels{of}", views.len(), pixels / 1e6);
         if count < number(needed, f64::INFINITY, scale) {
-            why += &format!(", and {steps} steps can train no more");
+            why += &format!(", and {steps} steps cannot train more");
         }
         let limit = match recipe.run.memory_limit {
             0 => available_memory().map_or(u64::MAX, |free| (MEMORY * free as f64) as u64),
@@ -64,7 +64,7 @@ impl OpenCapture {
             let middle = low.midpoint(high);
             if fits(middle) { low = middle } else { high = middle }
         }
-        Ok((rounded(low as f64), format!("{why}, and {} MiB of memory hold no more", limit >> 20)))
+        Ok((rounded(low as f64), format!("{why}, and {} MiB of memory do not hold more", limit >> 20)))
     }
 
     /// The recipe with a number of Gaussians for its steps if it states none; listeners learn which and why.

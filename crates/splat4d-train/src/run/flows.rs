@@ -1,5 +1,5 @@
-//! Optical flow of our own, where a capture brings none and the recipe requests it: followed once from every training
-//! image to the next one of its camera, kept next to the run in `flow/`, and from then on the capture's own.
+//! Optical flow computed by splat4d where a capture has none and the recipe requests it: once, from every training
+//! image to the next one of its camera. It is stored in the run's `flow/` and then used like flow of the capture.
 
 use super::checkpoint::write_atomically;
 use super::identity::fingerprint;

@@ -1,6 +1,6 @@
-//! The time that steps take, found out before a run: a few steps are timed at the initial and at the capped number of
-//! Gaussians, and the schedule's own densification states how many there are when. `--minutes M` begins with as many
-//! iterations as fit by that; [`budget`](super::budget) plans again when the machine turns out to be slower or faster.
+//! Estimates the time of a run: a few steps are timed at the initial and at the largest number of Gaussians, and the
+//! densification schedule gives the number in between. `--minutes M` begins with as many iterations as fit by that;
+//! [`budget`](super::budget) plans again when the machine turns out to be slower or faster.
 
 use super::clock::Stopwatch;
 use super::open::OpenCapture;

@@ -1,5 +1,5 @@
-//! [`OpenCapture`]: a capture as a recipe specifies, opened for training, and what is made of it: a plan, a first
-//! scene, a trainer.
+//! [`OpenCapture`]: a capture as a recipe specifies, opened for training, and the objects built from it: plan, initial
+//! scene, trainer.
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
@@ -96,16 +96,16 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lens
 /// Errors: a loss on flow or tracks, and not one training image has any.
 pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
     if recipe.loss.tracks > 0.0 && capture.train.iter().all(|&i| capture.frames[i].tracks.is_none()) {
-        return Err(Error::input("loss.tracks compares point tracks, and the capture's training cameras have none")
+        return Err(Error::input("loss.tracks needs point tracks, and the capture's training cameras have none")
             .remedy("Give cameras `tracks` in capture.json (docs/priors.md), or leave loss.tracks at 0"));
     }
     let own = recipe.capture.flow == FlowSource::Own;
     if recipe.loss.flow == 0.0 || own || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
         return Ok(());
     }
-    Err(Error::input("lambda_flow compares flow, and the capture's training images have none").remedy(
+    Err(Error::input("loss.flow needs optical flow, and the capture's training images have none").remedy(
         "Give cameras a `flow` in capture.json (docs/capture-format.md), compute it from the images with --set \
-         capture.flow=own, or leave lambda_flow at 0",
+         capture.flow=own, or leave loss.flow at 0",
     ))
 }
 
@@ -223,7 +223,7 @@ impl OpenCapture {
     /// pixels that no training camera sees. Errors: an image cannot be read.
     pub(super) fn background(&self) -> Result<[f32; 3]> {
         match self.capture.background {
-            Some(told) => Ok(told),
+            Some(own) => Ok(own),
             None => mean_color(self.frames.as_ref()),
         }
     }
@@ -304,9 +304,7 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // Cameras of a rig have colours of their own, and one image of each shows them. Photos of one camera differ
-        // where it
-        // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
+        // Cameras of a rig differ in colour, and one image of each shows it. Photos of one camera differ in exposure.
         let pictures = if self.capture.named || c.appearance.exposure_single { 1 } else { 2 };
         let trained: Vec<usize> =
             trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();

@@ -1,5 +1,5 @@
-//! Points that a capture's own images show, where it brings too few: found once, kept next to the run as `points.ply`,
-//! and from then on the capture's own.
+//! Points found in the images of a capture that has too few: computed once, stored in the run as `points.ply`, and then
+//! used like points of the capture.
 
 use super::checkpoint::write_atomically;
 use super::identity::fingerprint;

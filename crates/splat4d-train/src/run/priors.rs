@@ -1,5 +1,4 @@
-//! Checks of priors (depth, flow) against the images: before training what can be checked at once, after it what the
-//! scene made of them.
+//! Checks of priors (depth, flow): against the images before training, against the trained scene after it.
 
 use super::open::{OpenCapture, training_frames};
 use crate::capture::frames::{Depth, Frames, Picture};
@@ -44,8 +43,8 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
     let mut warnings = Vec::new();
     if recipe.loss.flow > 0.0 {
         let store = ImageStore::new(capture.clone(), 0);
-        let told = |i: &&usize| capture.frames[**i].flow.as_ref().is_some_and(|f| !f.of_view);
-        let all: Vec<usize> = capture.train.iter().filter(told).copied().collect();
+        let of_files = |i: &&usize| capture.frames[**i].flow.as_ref().is_some_and(|f| !f.of_view);
+        let all: Vec<usize> = capture.train.iter().filter(of_files).copied().collect();
         for &i in chosen(&all) {
             warnings.extend(flow_reads(capture, &store, i)?);
         }
@@ -60,15 +59,15 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
 /// Report about metric maps with surfaces behind points that were seen in front of them.
 fn points_before(opened: &OpenCapture) -> Result<Option<String>> {
     let looked = ratios(opened)?;
-    let told = |(i, ratios): &(usize, Vec<f64>)| {
+    let conflict = |(i, ratios): &(usize, Vec<f64>)| {
         let before = ratios.iter().filter(|r| **r < (1.0 - METRIC_OFF).ln()).count() as f64 / ratios.len() as f64;
         (before > BEFORE).then_some((*i, before))
     };
-    let found: Vec<(usize, f64)> = looked.iter().filter(|(_, r)| r.len() >= FEW).filter_map(told).collect();
+    let found: Vec<(usize, f64)> = looked.iter().filter(|(_, r)| r.len() >= FEW).filter_map(conflict).collect();
     Ok(found.first().map(|&(i, before)| {
         format!(
-            "{} of {} depth maps that were looked at show surfaces behind the capture's points, first that of {}: {:.0} % of the points \
-             in it stand before what it shows. Maps may be mirrored, of other frames, or of another kind (depth_kind, \
+            "{} of {} checked depth maps have surfaces behind the capture's points, first that of {}: {:.0} % of the points in \
+             this image are in front of the map. Maps may be mirrored, of other frames, or of another kind (depth_kind, \
              docs/priors.md); without them: --set loss.depth=0",
             found.len(),
             looked.len(),
@@ -125,8 +124,8 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     };
     if back < CLEARLY * forth && back < none {
         return refuse(
-            "the flow runs backwards: pixels are found against it",
-            "Flow leads from a frame to the next one of its camera: change its sign, or write that of the other direction",
+            "the flow is reversed: the opposite direction fits the images",
+            "Flow points from a frame to the next one of its camera: change its sign, or write the flow of the other direction",
         );
     }
     if turned < CLEARLY * forth && turned < none {
@@ -137,7 +136,7 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     }
     Ok((forth > none).then(|| {
         format!(
-            "the flow of {} explains the next image worse than no flow ({}): check its unit (pixels), its size and \
+            "the flow of {} predicts the next image worse than no flow ({}): check its unit (pixels), its size and \
              its target frame",
             name(capture, frame),
             file.path.display()
@@ -145,7 +144,7 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     }))
 }
 
-/// How metric depth relates to the capture's points.
+/// Ratio of metric depth to the capture's points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Depths {
     /// They agree, or cannot be compared.
@@ -170,8 +169,8 @@ fn ratios(opened: &OpenCapture) -> Result<Vec<(usize, Vec<f64>)>> {
         let ratio = |&point: &[f64; 3]| {
             let ([u, v], z) = camera.project(point)?;
             let inside = (0.0..camera.width as f64).contains(&u) && (0.0..camera.height as f64).contains(&v);
-            let told = if inside { depth.values.get(0, v as usize, u as usize) } else { 0.0 };
-            (told > 0.0).then(|| (z / f64::from(told)).ln())
+            let stored = if inside { depth.values.get(0, v as usize, u as usize) } else { 0.0 };
+            (stored > 0.0).then(|| (z / f64::from(stored)).ln())
         };
         all.push((i, still.iter().filter_map(ratio).collect()));
     }
@@ -251,17 +250,17 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
         draw(scene, opened, i, &mut renderer, &mut image);
         looked += 1;
         let Some(apart) = apart([&image.depth, &image.alpha], Depth::truth(depth)) else { continue };
-        let told = match apart {
+        let difference = match apart {
             Apart::Ratio(ratio, off) if off > METRIC_OFF => {
                 format!("by {:.0} % (it renders {ratio:.2} times the depth)", 100.0 * off)
             }
             Apart::Correlation(r) if r < CORRELATED => format!("(correlation {r:.2})"),
             _ => continue,
         };
-        found.push(format!("{} {told}", name(capture, capture.train[i])));
+        found.push(format!("{} {difference}", name(capture, capture.train[i])));
     }
     let Some(first) = found.first() else { return Ok(Vec::new()) };
-    let upside = "maps may be of another kind (depth_kind), unit (depth_scale) or frame, or simply wrong there";
+    let upside = "maps may be of another kind (depth_kind), unit (depth_scale) or frame, or wrong";
     Ok(vec![format!(
         "the scene contradicts {} of {looked} checked depth maps, first that of {first}: the images were used, and \
          {upside}",
@@ -298,13 +297,13 @@ mod tests {
         wall((x as f64 + 0.5 - 16.0) / FOCAL)
     }
 
-    /// Two cameras in one place look at the wall, with points on it; maps report `told` for a column.
-    fn opened(folder: &Path, kind: &str, told: &dyn Fn(usize) -> f64) -> OpenCapture {
+    /// Two cameras in one place look at the wall, with points on it; maps report `depth_of` for a column.
+    fn opened(folder: &Path, kind: &str, depth_of: &dyn Fn(usize) -> f64) -> OpenCapture {
         let mut cameras = Vec::new();
         for c in 0..2 {
             let picture = image::RgbImage::from_pixel(SIDE as u32, SIDE as u32, image::Rgb([90, 90, 90]));
             picture.save(folder.join(format!("{c}.png"))).unwrap();
-            let values: Vec<f32> = (0..SIDE * SIDE).map(|p| told(p % SIDE) as f32).collect();
+            let values: Vec<f32> = (0..SIDE * SIDE).map(|p| depth_of(p % SIDE) as f32).collect();
             let mut file = Vec::new();
             npy::write_f32(&[SIDE, SIDE], &values, &mut file).unwrap();
             std::fs::write(folder.join(format!("d{c}.npy")), file).unwrap();

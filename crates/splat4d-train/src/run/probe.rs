@@ -1,4 +1,4 @@
-//! A run that is never driven: reads checkpoints whatever their bytes, for tests of damaged files.
+//! Reads checkpoints without a run, whatever their bytes: for tests of damaged files.
 
 use super::checkpoint::{self, Identity, RunState};
 use super::identity::identity;

@@ -1,4 +1,5 @@
-//! Runs that do not begin with points: a scene and a list of stages, driven as safely as training is.
+//! Runs that start from a scene instead of points: a list of stages with the same checkpoints and rollbacks as
+//! training.
 
 #[cfg(test)]
 mod tests;
@@ -47,7 +48,7 @@ pub(crate) struct Refine {
 /// The result of a refinement.
 #[derive(Debug)]
 pub(crate) struct Refined {
-    /// How the run ended.
+    /// End of the run.
     pub outcome: Outcome,
     /// The scene that learns. If the last stage has a codec, the decoded scene differs: it is in the run's
     /// `scene.safetensors`.

@@ -52,7 +52,7 @@ pub struct TrainOptions {
     pub snapshots: Option<Duration>,
 }
 
-/// A loss on images that a caller brings along: makes its term, once for every run.
+/// A caller's loss on images: makes its term, once for every run.
 #[derive(Clone)]
 pub struct OwnLoss(pub Arc<dyn Fn() -> Box<dyn ImageTerm> + Send + Sync>);
 
@@ -71,7 +71,7 @@ impl TrainOptions {
     }
 }
 
-/// How a run ended.
+/// End of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
     /// Its folder.
@@ -98,8 +98,8 @@ fn under_fitted(gaussians: usize, cap: usize, psnr: f64) -> Option<String> {
     let full = gaussians as f64 >= AT_CAP * cap as f64;
     (full && psnr < UNDER_FITTED).then(|| {
         format!(
-            "training views end at {psnr:.1} dB with all {cap} Gaussians in use: more of them and more steps resolve more \
-             (--minutes, --quality best, or --set densify.max_cap={})",
+            "training views reach only {psnr:.1} dB with all {cap} Gaussians in use: more Gaussians and more steps \
+             give more detail (--minutes, --quality best, or --set densify.max_cap={})",
             2 * cap
         )
     })
@@ -258,7 +258,7 @@ impl Session<'_> {
         let interval = self.snapshots.filter(|_| shown.is_ok());
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
         let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.opened.capture, antialias));
-        let (mut clock, mut told) = (self.clock.seconds(), Clock::now());
+        let (mut clock, mut reported) = (self.clock.seconds(), Clock::now());
         // A run that was continued has a clock that began later than its first command.
         let lead = self.budget.filter(|_| first > 0).map_or(0.0, |b| b.before + state.seconds - clock);
         let mut recipe = self.recipe.clone();
@@ -324,8 +324,8 @@ impl Session<'_> {
             note(&step.measured, &mut state, &mut metrics);
             // A device's first steps are measured some steps later.
             let known = state.smooth != [0.0; 2];
-            if known && told.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
-                told = Clock::now();
+            if known && reported.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
+                reported = Clock::now();
                 listen(&self.progress(trainer, &state, &steps));
             }
             let i = trainer.progress.iteration;
@@ -472,7 +472,9 @@ impl Session<'_> {
                 ErrorKind::Diverged,
                 format!("training diverged {strikes} times, last at iteration {failed}: {what}"),
             )
-            .remedy("Look for wrong poses with `splat4d info CAPTURE`, or lower position_lr_init and scaling_lr"));
+            .remedy(
+                "Look for wrong poses with `splat4d info CAPTURE`, or lower rates.position_init and rates.scaling",
+            ));
         }
         let (state, _) = restore_newest(self.run, trainer, &self.identity)?;
         trainer.progress.strikes = strikes;

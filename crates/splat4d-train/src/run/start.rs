@@ -1,4 +1,4 @@
-//! How a run begins, and how it continues from its folder.
+//! Starts runs, and continues them from their folders.
 
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
@@ -145,7 +145,7 @@ fn timed(
         _ => most,
     };
     if let Some((_, why)) = needed {
-        let more = if count < most { ", and the steps that fit the minutes can train no more" } else { "" };
+        let more = if count < most { ", and the steps that fit the minutes cannot train more" } else { "" };
         listen(&Event::Counted { gaussians: count, why: why + more });
     }
     let recipe = fit(count)?;

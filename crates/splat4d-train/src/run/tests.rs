@@ -15,7 +15,7 @@ use super::session::{MAX_STRIKES, ROLLBACK_RATE, Session, restore_newest};
 use super::start::TRAIN;
 use super::*;
 use crate::capture::frames::{Frames, Picture};
-use crate::capture::{Capture, ImageStore};
+use crate::capture::{Capture, ImageStore, Timing};
 use crate::event::Event;
 use crate::init::Source;
 use crate::recipe::{MotionName, Recipe};
@@ -571,7 +571,7 @@ fn opaque_captures_get_their_mean_colour_as_background_and_masked_ones_their_own
 }
 
 #[test]
-fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
+fn exposure_is_learned_for_rigs_and_photos() {
     let place = Place::new();
     let exposed = |named: bool, changes: &[&str]| {
         let recipe = recipe(changes);
@@ -582,9 +582,46 @@ fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
         opened.trainer(&recipe, &plan, scene).unwrap().train_state.exposure.is_some()
     };
     let moment = ["exposure=true", "max_frames=1"];
-    assert!(exposed(true, &moment) && exposed(false, &["exposure=true"]) && !exposed(false, &moment));
-    assert!(exposed(false, &[&moment[..], &["appearance.exposure_single=true"]].concat()));
+    assert!(exposed(true, &moment) && exposed(false, &["exposure=true"]) && exposed(false, &moment));
+    assert!(!exposed(false, &[&moment[..], &["appearance.exposure_single=false"]].concat()));
     assert!(!exposed(true, &["exposure=false"]));
+}
+
+/// Cameras that count as photos, whose exposures were brighter and brighter: the run writes what it learnt, and an evaluation shows
+/// held-out photos with it.
+#[test]
+fn photos_are_measured_with_the_exposure_that_was_learnt() {
+    use crate::eval::run::{EvalOptions, assess};
+    use crate::run::corrected;
+    let place = Place::new();
+    let recipe = recipe(&["hold_out=camera=1", "max_frames=1"]);
+    let capture = Arc::new(Capture { named: false, timing: Timing::Moment, ..Capture::clone(&place.open(&recipe)) });
+    let opened = OpenCapture::new(capture.clone(), &recipe).unwrap();
+    let plan = opened.plan(&recipe);
+    let scene = opened.initial_scene(&recipe, &plan).unwrap();
+    let mut trainer = opened.trainer(&recipe, &plan, scene).unwrap();
+    let exposure = trainer.train_state.exposure.as_mut().unwrap();
+    let key = exposure.key();
+    for &camera in exposure.trained().to_vec().iter() {
+        exposure.params[key].write(camera, 0, std::array::from_fn(|k| if k == 9 { 0.1 } else { 0.0 }));
+    }
+    let folder = place.run("photos");
+    std::fs::create_dir_all(&folder).unwrap();
+    corrected::write(&folder, &trainer, &capture).unwrap();
+    let exposures = corrected::exposures(&capture, &folder).unwrap();
+    let held = exposures[capture.held[0]];
+    assert!((held[9] - 0.1).abs() < 1e-6 && held[8] == 0.0, "{held:?}");
+    // The capture shows what is rendered, in red by a tenth more.
+    let store = Arc::new(ImageStore::new(capture.clone(), 1 << 20));
+    let red = |exposures: Vec<_>| {
+        let options = EvalOptions { exposures, pictures: true, folder: folder.clone(), ..EvalOptions::default() };
+        let scene = trainer.train_state.scene();
+        assess(scene, &capture, &store, 7, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
+        let image = image::open(folder.join("test/ours_7/renders/00000.png")).unwrap().to_rgb8();
+        image.pixels().map(|p| f64::from(p[0]) / 255.0).sum::<f64>() / f64::from(image.width() * image.height())
+    };
+    let (plain, exposed) = (red(Vec::new()), red(exposures));
+    assert!(plain < 0.85 && (exposed - plain - 0.1).abs() < 0.03, "{plain} {exposed}");
 }
 
 #[test]

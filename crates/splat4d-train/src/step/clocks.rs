@@ -1,10 +1,9 @@
-//! Search of clocks: by how much every camera is early or late, by a scene that need not be finished. A
-//! camera's images
-//! are compared with the scene at shifted times, and the shift that suits them best wins.
+//! Search of time offsets with an unfinished scene: a camera's images are compared with renders at shifted times, and
+//! the shift with the smallest difference is selected.
 //!
-//! Gradients alone do not find shifts of whole frames: their reach is the width of edges. The scene was learnt with the
-//! wrong clocks, but of any one of them it is mostly the others' scene; so the search is repeated while it learns, as
-//! points and their partners are in ICP (Besl and McKay 1992).
+//! Gradients alone do not find shifts of whole frames: their reach is the width of edges. The scene was trained with
+//! wrong offsets, but compared with any one camera it mostly follows the other cameras; so the search is repeated while
+//! it learns, as points and their partners are in ICP (Besl and McKay 1992).
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};

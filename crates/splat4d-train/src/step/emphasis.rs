@@ -1,5 +1,5 @@
-//! [`Emphasis`]: pixels of dynamic regions weigh more. Dynamic regions are a small part of most images and the hardest,
-//! since a still Gaussian learns from every frame and a moving one from those of its lifespan.
+//! [`Emphasis`]: larger weights for pixels of dynamic regions. These are a small part of most images and the hardest,
+//! because a static Gaussian is trained by every frame and a moving one only by those of its lifespan.
 //!
 //! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there
 //! and weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).

@@ -1,5 +1,5 @@
-//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can be
-//! in its place, since a plan states all that a step is of, and a learner states what happened to it between steps.
+//! [`Engine`]: takes training steps. [`CpuEngine`] runs on the CPU. An engine with tables on a device can replace it,
+//! because a plan describes the whole step and the training state records its changes between steps.
 
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
@@ -67,7 +67,7 @@ pub struct Stepped {
     pub adam: Duration,
     /// Maintenance, noise and the rest.
     pub other: Duration,
-    /// Gaussians born, moved, removed.
+    /// Gaussians added, moved, removed.
     pub change: Change,
     /// A message for the user about the rendering device.
     pub notices: Vec<String>,
@@ -192,7 +192,7 @@ pub struct CpuEngine<'a> {
     /// Whether `shown` is to be copied from the scene again.
     stale: bool,
     /// Whether it was reported that images are compared on the CPU.
-    told: bool,
+    reported: bool,
 }
 
 impl<'a> CpuEngine<'a> {
@@ -205,7 +205,7 @@ impl<'a> CpuEngine<'a> {
             rates: Vec::new(),
             shown: Scene::default(),
             stale: true,
-            told: false,
+            reported: false,
         }
     }
 
@@ -235,9 +235,9 @@ impl<'a> CpuEngine<'a> {
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
         let mut image = plan.loss.of_step(pictures, exposure);
-        if !self.told && compares(self.backend.as_ref()) && plan.views.iter().any(|v| image.target(v).is_none()) {
+        if !self.reported && compares(self.backend.as_ref()) && plan.views.iter().any(|v| image.target(v).is_none()) {
             out.notices.push("the CPU compares images: the recipe's loss on them is more than L1 and D-SSIM".into());
-            self.told = true;
+            self.reported = true;
         }
         let mut losses = Losses { image: &mut image, probes, params };
         let step = Step { scene, views: plan.views, info: plan.info, sh_degree: plan.sh_degree };

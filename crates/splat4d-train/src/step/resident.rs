@@ -48,7 +48,7 @@ pub(crate) struct DeviceEngine<'a> {
     /// Whether the device has failed or is out of memory.
     given_up: bool,
     /// Whether it was reported that the CPU keeps the tables.
-    told: bool,
+    reported: bool,
     /// See [`rates_of`].
     rates: Rates,
     /// Tables that are kept, by layer.
@@ -66,7 +66,7 @@ impl<'a> DeviceEngine<'a> {
             cpu,
             newest: Newest::TrainState,
             given_up: false,
-            told: false,
+            reported: false,
             rates,
             known: Vec::new(),
             under_way: VecDeque::new(),
@@ -76,7 +76,7 @@ impl<'a> DeviceEngine<'a> {
 
     /// Reports once why the CPU keeps the tables of a device that could.
     fn report(&mut self, why: &str, notices: &mut Vec<String>) {
-        if !std::mem::replace(&mut self.told, true) {
+        if !std::mem::replace(&mut self.reported, true) {
             notices.push(format!("the CPU keeps the tables and steps: {why}"));
         }
     }
@@ -190,10 +190,10 @@ fn known(
 ) -> std::result::Result<Vec<ResidentMotion>, String> {
     let (stage, scene) = (&*plan.stage, train_state.scene());
     let of_stage = [
-        (!stage.probes.is_empty(), "losses look at several times"),
-        (stage.codec.is_some(), "scenes are shown as their file will be read"),
-        (train_state.corrections.is_some(), "cameras learn"),
-        (scene.head_keys().is_some(), "a pixel head learns"),
+        (!stage.probes.is_empty(), "losses compare several times"),
+        (stage.codec.is_some(), "renders use the decoded playback file"),
+        (train_state.corrections.is_some(), "cameras are refined"),
+        (scene.head_keys().is_some(), "a pixel head is trained"),
     ];
     if let Some((_, why)) = of_stage.iter().find(|(is, _)| *is) {
         return Err((*why).into());
@@ -205,11 +205,11 @@ fn known(
         };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
         if !plain || !layer.frame.is_identity() {
-            return Err(format!("`{}` is seen for a part of the time, or in axes of its own", layer.name));
+            return Err(format!("layer `{}` has a time span or axes of its own", layer.name));
         }
         let learns = |key: &Key| rates.get(key.0 as usize).is_some_and(|r| r.iter().flatten().any(|r| *r != 0.0));
         if let Some(key) = layer.params.keys().filter(learns).find(|k| !known.keys.contains(&Some(*k))) {
-            return Err(format!("`{}` is learnt, which the GPU does not support", layer.params.column_name(key, 0)));
+            return Err(format!("the GPU does not train `{}`", layer.params.column_name(key, 0)));
         }
         all.push(known);
     }
@@ -221,7 +221,7 @@ fn known(
         None => false,
     };
     match stage.params.iter().find(|loss| !knows(loss.kept())) {
-        Some(loss) => Err(format!("the loss `{}` reads raw values", loss.name())),
+        Some(loss) => Err(format!("the GPU does not support the loss `{}` on raw parameters", loss.name())),
         None => Ok(all),
     }
 }

@@ -1,4 +1,4 @@
-//! [`Trainer`]: the state of a run and one step of it. Files, progress and clocks are the business of `run`.
+//! [`Trainer`]: the state of a run and one step of it. Module `run` handles files, progress and time.
 
 use super::batch::Batch;
 use super::chain::StepInfo;
@@ -42,7 +42,7 @@ pub struct Settings {
     pub exposure_lr: f64,
 }
 
-/// How far a run is. All of it is in every checkpoint.
+/// Progress of a run. All of it is in every checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Position {
     /// Steps taken.
@@ -78,7 +78,7 @@ pub struct Trainer<'a> {
     pub train_state: TrainState,
     /// The stages, in order.
     pub stages: Vec<Stage>,
-    /// How far.
+    /// Progress.
     pub progress: Position,
     /// Compares images.
     pub loss: TrainLoss,
@@ -314,7 +314,7 @@ impl<'a> Trainer<'a> {
         }
         out.change = self.keep_up(place + 1..=next, |_| true)?;
         if self.scene().is_empty() {
-            let what = "not one Gaussian is left: all of them became transparent or huge";
+            let what = "no Gaussian is left: all became transparent or too large";
             return Ok(Err(Fault(what.into(), Blame::Numbers, None)));
         }
         self.progress.iteration += 1;
@@ -464,7 +464,7 @@ impl<'a> Trainer<'a> {
     /// Errors if the scene is empty: nothing could be learnt.
     pub(crate) fn check_not_empty(&self) -> Result<()> {
         if self.scene().layers.iter().all(|l| l.params[GEOMETRY].rows() == 0) {
-            return Err(Error::new(ErrorKind::BadInput, "there is not one Gaussian to start from")
+            return Err(Error::new(ErrorKind::BadInput, "there are no initial Gaussians")
                 .remedy("Give points, masks or --set init=random --set num_pts=10000"));
         }
         Ok(())

@@ -1,10 +1,10 @@
-//! `Corrections`: learnt corrections of camera poses and times.
+//! `Corrections`: learnt corrections of camera poses, focal lengths and time offsets.
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
 //! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
-//! of all times of a camera. Images carry no information about the scene's absolute position, how large it is and when
-//! it begins: the cameras' mean motion, their mean growth and the median of their clocks stay. The median, since of a
-//! rig with one clock that is wrong the others are right.
+//! of all times of a camera. Images do not determine the absolute position, scale and start time of the scene, so the
+//! cameras' mean motion, mean scale and median time offset are fixed. The median is used because a single wrong offset
+//! must not shift the correct ones.
 
 use crate::optim::step_row;
 use crate::settings::settings;

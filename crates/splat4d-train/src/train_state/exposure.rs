@@ -1,13 +1,15 @@
-//! [`Exposure`]: what learns of the cameras.
+//! [`Exposure`]: learnt colour matrices of the cameras.
 
+use crate::capture::Capture;
 use crate::optim::Moments;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
 use splat4d::simd::{Kernel, Simd, dispatch, each};
+use std::collections::BTreeSet;
 
 /// Columns of a camera: its matrix without the identity, row by row, then an offset a channel.
-const COLUMNS: usize = 12;
+pub const COLUMNS: usize = 12;
 /// The first offset.
 const OFFSET: usize = 9;
 /// Pixels of a piece of parallel work: sums are per piece and in order, so that they do not depend on the threads.
@@ -107,6 +109,11 @@ impl Kernel for RespondBackward<'_> {
     }
 }
 
+/// Turns the colours that were rendered into those that a camera with this row shows.
+pub(crate) fn expose(row: &[f32; COLUMNS], color: &mut Planes<f32>) {
+    pieces(color).for_each(|colors| respond(row, colors));
+}
+
 impl Exposure {
     /// The identity for every camera; only the `trained` ones ever change.
     pub(crate) fn new(cameras: usize, trained: Vec<usize>) -> Self {
@@ -115,6 +122,16 @@ impl Exposure {
             .entry("exposure", Space::Fixed, &[("exposure", COLUMNS)], cameras, |_| {})
             .expect("a new table fits itself");
         Self { moments: Moments::new(&params).rarely_used(), grads: Grads::new(&params), params, key, trained }
+    }
+
+    /// Those that a run has learnt, by the capture's frames. The training cameras go on.
+    pub(crate) fn learnt(capture: &Capture, rows: &[[f32; COLUMNS]]) -> Self {
+        let cameras = |frames: &[usize]| frames.iter().map(|&f| capture.frames[f].camera).collect::<BTreeSet<_>>();
+        let mut out = Self::new(capture.cameras.len(), cameras(&capture.train).into_iter().collect());
+        for &frame in &capture.train {
+            out.params[out.key].write(capture.frames[frame].camera, 0, rows[frame]);
+        }
+        out
     }
 
     /// The table's key.
@@ -150,8 +167,7 @@ impl Exposure {
 
     /// Turns the colours `color` into those that camera `rig` shows.
     pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let row = self.response(rig);
-        pieces(color).for_each(|colors| respond(&row, colors));
+        expose(&self.response(rig), color);
     }
 
     /// Writes the colours that camera `rig` shows of what was rendered.

@@ -1,5 +1,5 @@
-//! The images that points are searched for in: the static background as fixed cameras see it, single times, or the
-//! frames of moving cameras.
+//! The images in which points are searched: the static background as fixed cameras see it, single times, or the frames
+//! of moving cameras.
 
 use super::raster::{blurred, grey};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! `info --doctor`: everything that is wrong with a capture, on the terminal, as a page and as JSON.
+//! `info --doctor`: problems of a capture, on the terminal, as a page and as JSON.
 
 use super::Inspection;
 use crate::events::Listener;

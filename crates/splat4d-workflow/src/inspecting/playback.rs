@@ -1,4 +1,4 @@
-//! Content of a playback file's index: sections, sizes, and how much has to arrive before there is something to see.
+//! Content of a playback file's index: sections, sizes, and the bytes that a player needs before the first frame.
 
 use super::line;
 use crate::files::{grouped, human_bytes};
@@ -85,7 +85,7 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
     IndexSummary { text, json }
 }
 
-/// How a playback file deviates from its specification.
+/// Deviations of a playback file from its specification.
 #[derive(Clone, Debug)]
 pub struct Conformance {
     /// Version of the format that the file states: major, minor.

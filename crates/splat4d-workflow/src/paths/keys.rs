@@ -124,9 +124,9 @@ impl Track {
 
     /// Straight lines between the keys that state a scene time.
     fn scene_time(&self, t: f64) -> Option<f64> {
-        let told = || self.keys.iter().filter_map(|k| k.scene_time.map(|s| (k.time, s)));
-        let before = told().take_while(|k| k.0 <= t).last();
-        let after = told().find(|k| k.0 > t);
+        let timed = || self.keys.iter().filter_map(|k| k.scene_time.map(|s| (k.time, s)));
+        let before = timed().take_while(|k| k.0 <= t).last();
+        let after = timed().find(|k| k.0 > t);
         match (before, after) {
             (Some(a), Some(b)) => Some(a.1 + (b.1 - a.1) * (t - a.0) / (b.0 - a.0)),
             (a, b) => a.or(b).map(|k| k.1),

@@ -76,7 +76,7 @@ pub struct Clock {
     pub to: f64,
     /// Everything at this one time.
     pub freeze: Option<f64>,
-    /// How many times slower than life; `None`: as the route likes.
+    /// Slow-motion factor; `None`: that of the route.
     pub slow_motion: Option<f64>,
     /// Length of the film, in place of `slow_motion`; `None`: as the route likes.
     pub seconds: Option<f64>,
@@ -111,7 +111,7 @@ impl Clock {
         let frames = (seconds * self.fps).round().max(1.0);
         if frames > MAX_FRAMES {
             return Err(Error::input(format!("the film would have {frames} frames")).remedy(format!(
-                "Take a shorter time range, fewer frames a second or less slow motion: {MAX_FRAMES} is the most."
+                "Take a shorter time range, fewer frames per second or less slow motion: {MAX_FRAMES} is the most."
             )));
         }
         Ok(frames as usize)

@@ -1,4 +1,4 @@
-//! The files of a prediction, but for its page.
+//! The files of a prediction, except its page.
 
 use super::{Forecast, Summary, Work};
 use crate::baking::{Baking, bake_into};
@@ -15,12 +15,12 @@ use std::path::Path;
 pub(super) fn all(
     work: &Work,
     folder: &Path,
-    told: &Summary,
+    summary: &Summary,
     forecasts: &[Forecast],
     best: &Forecast,
     console: &dyn Listener,
 ) -> Result<()> {
-    files::write(&folder.join("predict.json"), &serde_json::to_vec_pretty(told).expect("results are plain data"))?;
+    files::write(&folder.join("predict.json"), &serde_json::to_vec_pretty(summary).expect("results are plain data"))?;
     files::write(&folder.join("dynamics.safetensors"), &dynamics(work, forecasts)?)?;
     let mut bytes = Vec::new();
     splat4d::format::scene::write(&best.scene, &mut bytes)?;

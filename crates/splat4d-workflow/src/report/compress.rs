@@ -79,32 +79,32 @@ impl Compressed {
         self.unpruned.as_ref().unwrap_or(&self.before)
     }
 
-    /// How many times smaller than the plain file; `None` if that was not measured.
+    /// Size ratio of the plain file to this one; `None` if that was not measured.
     fn smaller_than_plain(&self) -> Option<f64> {
         let plain = self.plain.as_ref().filter(|p| p.bytes > 0 && self.after.bytes > 0)?;
         Some(plain.bytes as f64 / self.after.bytes as f64)
     }
 
-    /// How many times smaller than 32-bit floats; `None` where there is nothing.
+    /// Size ratio of 32-bit floats to this file; `None` where there is nothing.
     pub fn smaller(&self) -> Option<f64> {
         (self.after.bytes > 0).then(|| self.before.float_bytes as f64 / self.after.bytes as f64)
     }
 }
 
 /// The content of a compressed run's `compress.json`; `None` for other runs and other versions.
-pub(super) fn told(run: &Run) -> Option<Compressed> {
+pub(super) fn compressed(run: &Run) -> Option<Compressed> {
     if run.compressed.is_null() { None } else { serde_json::from_value(run.compressed.clone()).ok() }
 }
 
 /// The result of a compression in a sentence.
-pub(super) fn verdict(told: &Compressed) -> String {
-    let mut out = format!("Compressed to {}", human_bytes(told.after.bytes));
-    match (told.smaller_than_plain(), told.smaller()) {
+pub(super) fn verdict(compressed: &Compressed) -> String {
+    let mut out = format!("Compressed to {}", human_bytes(compressed.after.bytes));
+    match (compressed.smaller_than_plain(), compressed.smaller()) {
         (Some(x), _) => _ = write!(out, ", {x:.1} times smaller than the plain file"),
         (None, Some(x)) => _ = write!(out, ", {x:.1} times smaller than 32-bit floats"),
         (None, None) => {}
     }
-    if let Some((before, after)) = told.before.psnr.zip(told.after.psnr) {
+    if let Some((before, after)) = compressed.before.psnr.zip(compressed.after.psnr) {
         let _ = write!(out, ". Held-out views: {after:.2} dB PSNR, {:+.2} dB against the source", after - before);
     }
     out + "."
@@ -115,33 +115,33 @@ pub(super) fn section(out: &mut String, run: &Run) {
     if run.compressed.is_null() {
         return;
     }
-    let Some(told) = told(run) else {
+    let Some(compressed) = compressed(run) else {
         let _ = writeln!(out, "<div class=\"warn\">{FILE} was written by another version of splat4d.</div>");
         return;
     };
-    let level = told.level.map(|l| format!(", level {l}")).unwrap_or_default();
+    let level = compressed.level.map(|l| format!(", level {l}")).unwrap_or_default();
     let _ = writeln!(
         out,
         "<h2>Compressed</h2>\n<p class=\"note\">From {}{level}.</p>",
-        escape(&told.source.display().to_string())
+        escape(&compressed.source.display().to_string())
     );
-    guard(out, &told);
-    sides(out, &told);
+    guard(out, &compressed);
+    sides(out, &compressed);
     panels(
         out,
         "File size by part, and stages",
         [
             ("Bytes of scene.s4d", parts(&playable::of_run(&run.path))),
-            ("Stages", stages(&told.stages)),
-            ("PSNR over size, all trials, dB", tried(&told.tried)),
+            ("Stages", stages(&compressed.stages)),
+            ("PSNR over size, all trials, dB", tried(&compressed.tried)),
         ],
     );
-    both_pictures(out, run, &told);
-    settings(out, &told.settings);
+    both_pictures(out, run, &compressed);
+    settings(out, &compressed.settings);
 }
 
-fn guard(out: &mut String, told: &Compressed) {
-    if let Some(Guard { loss_db, limit_db, passed }) = told.guard {
+fn guard(out: &mut String, compressed: &Compressed) {
+    if let Some(Guard { loss_db, limit_db, passed }) = compressed.guard {
         let verdict = if passed { "within" } else { "more than" };
         let class = if passed { "note" } else { "warn" };
         let change = if loss_db < 0.0 { "gained" } else { "lost" };
@@ -151,7 +151,7 @@ fn guard(out: &mut String, told: &Compressed) {
             loss_db.abs()
         );
     }
-    for warning in &told.warnings {
+    for warning in &compressed.warnings {
         let _ = writeln!(out, "<div class=\"warn\">{}</div>", escape(warning));
     }
 }
@@ -159,8 +159,8 @@ fn guard(out: &mut String, told: &Compressed) {
 /// A line of the table: its name, how a side prints it, and how the change is printed.
 type Line<'a> = (&'a str, &'a dyn Fn(&Side) -> Option<String>, Option<String>);
 
-fn sides(out: &mut String, told: &Compressed) {
-    let (fair, after) = (told.fair(), &told.after);
+fn sides(out: &mut String, compressed: &Compressed) {
+    let (fair, after) = (compressed.fair(), &compressed.after);
     let plain = |digits: usize, v: Option<f64>| v.map(|v| format!("{v:.digits$}"));
     let less = |before: f64, after: f64| (after > 0.0 && before > 0.0).then(|| format!("{:.1}x less", before / after));
     let more = |before: f64, after: f64| (before > 0.0).then(|| format!("{:.2}x", after / before));
@@ -183,9 +183,10 @@ fn sides(out: &mut String, told: &Compressed) {
         (
             "file",
             &|s| Some(human_bytes(s.bytes)),
-            told.smaller_than_plain()
+            compressed
+                .smaller_than_plain()
                 .map(|x| format!("{x:.1}x less than the plain file"))
-                .or_else(|| told.smaller().map(|x| format!("{x:.1}x less than the source's 32-bit floats"))),
+                .or_else(|| compressed.smaller().map(|x| format!("{x:.1}x less than the source's 32-bit floats"))),
         ),
         ("Mbit/s", &|s| plain(1, s.mbit_per_s), None),
         ("PSNR, held-out views, dB", &|s| plain(2, s.psnr), gain(2, |s| s.psnr)),
@@ -199,9 +200,9 @@ fn sides(out: &mut String, told: &Compressed) {
         ("bytes to first image, ms", &|s| plain(1, Some(s.decode_ms)), less(fair.decode_ms, after.decode_ms)),
     ];
     let columns: Vec<(&str, &Side)> = [
-        ("before", Some(&told.before)),
-        ("not pruned, same steps", told.unpruned.as_ref()),
-        ("plain file", told.plain.as_ref()),
+        ("before", Some(&compressed.before)),
+        ("not pruned, same steps", compressed.unpruned.as_ref()),
+        ("plain file", compressed.plain.as_ref()),
         ("compressed", Some(after)),
     ]
     .into_iter()
@@ -224,7 +225,7 @@ fn sides(out: &mut String, told: &Compressed) {
         out.push_str("</tr>");
     }
     let against =
-        if told.unpruned.is_some() { "the scene trained for the same steps without pruning" } else { "before" };
+        if compressed.unpruned.is_some() { "the scene trained for the same steps without pruning" } else { "before" };
     let _ = write!(
         out,
         "</table></div>\n<p class=\"note\">The last column compares with {against}. Frames per second: this \
@@ -280,16 +281,17 @@ fn tried(tried: &[Tried]) -> Option<String> {
     let mut points: Vec<(f64, f64)> = tried.iter().map(|t| (t.bytes as f64 / (1 << 20) as f64, t.psnr)).collect();
     points.sort_by(|a, b| a.0.total_cmp(&b.0));
     let curve = lines(&[Series { name: String::new(), points }], "MiB", "dB")?;
-    let told: Vec<String> = tried
+    let trials: Vec<String> = tried
         .iter()
         .map(|t| format!("{} % pruned: {}, {:.2} dB", short(100.0 * t.prune), human_bytes(t.bytes), t.psnr))
         .collect();
-    Some(format!("{curve}<p class=\"note\">{}</p>", escape(&told.join(" · "))))
+    Some(format!("{curve}<p class=\"note\">{}</p>", escape(&trials.join(" · "))))
 }
 
 /// Held-out views as the source shows them, as the file does, and where they differ.
-fn both_pictures(out: &mut String, run: &Run, told: &Compressed) {
-    let Some((before, after)) = Run::open(&told.source).ok().and_then(|r| r.pictures()).zip(run.pictures()) else {
+fn both_pictures(out: &mut String, run: &Run, compressed: &Compressed) {
+    let Some((before, after)) = Run::open(&compressed.source).ok().and_then(|r| r.pictures()).zip(run.pictures())
+    else {
         return;
     };
     let mut shown = String::new();

@@ -1,4 +1,4 @@
-//! `doctor.html`: what is wrong with a capture, worst first, and every camera's image and figures.
+//! `doctor.html`: problems of a capture, worst first, and every camera's image and measurements.
 
 use super::chart::escape;
 use super::{STYLE, pictures, rig_map};
@@ -166,7 +166,7 @@ fn pairs(report: &Report) -> String {
     out + "</table></details>\n"
 }
 
-/// How bad it is, in a word.
+/// Severity, in a word.
 pub fn word(grade: Grade) -> &'static str {
     match grade {
         Grade::Bad => "bad",

@@ -48,7 +48,7 @@ fn page(run: &Run) -> String {
     views(&mut body, run);
     curves(&mut body, run);
     scores(&mut body, run);
-    lives(&mut body, run);
+    lifespans(&mut body, run);
     conditions(&mut body, run);
     costs(&mut body, run);
     again(&mut body, run);
@@ -82,11 +82,11 @@ fn header(out: &mut String, run: &Run) {
 
 /// The result in a sentence, and what to do with it.
 fn verdict(run: &Run) -> String {
-    if let Some(told) = compress::told(run) {
+    if let Some(compressed) = compress::compressed(run) {
         let place = escape(&in_command(&run.path));
         return format!(
             "<p class=\"verdict\">{}</p><p>Play it: <code>splat4d view {place}</code>.</p>",
-            escape(&compress::verdict(&told))
+            escape(&compress::verdict(&compressed))
         );
     }
     let Some(psnr) = run.score("PSNR") else { return String::new() };
@@ -120,8 +120,8 @@ fn cards(out: &mut String, run: &Run) {
             escape(name)
         );
     };
-    if let Some(told) = compress::told(run) {
-        let text = human_bytes(told.after.bytes);
+    if let Some(compressed) = compress::compressed(run) {
+        let text = human_bytes(compressed.after.bytes);
         let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
         card("main", value.into(), unit, "compressed file scene.s4d");
     }
@@ -324,8 +324,8 @@ fn scores(out: &mut String, run: &Run) {
     }
 }
 
-/// How long Gaussians can be seen.
-fn lives(out: &mut String, run: &Run) {
+/// Histogram of lifespans.
+fn lifespans(out: &mut String, run: &Run) {
     let counts = run.info.get("lives").and_then(crate::camera_file::numbers).unwrap_or_default();
     let all: f64 = counts.iter().sum();
     let share = |bin: usize| {
@@ -354,14 +354,14 @@ fn conditions(out: &mut String, run: &Run) {
     let mut rows = String::new();
     for entry in own.into_iter().chain(baselines(&run.all_results)) {
         // Runs of older versions do not contain it.
-        let Some(told) = entry.scores.get("conditions") else { continue };
-        let text = |key: &str| told.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
+        let Some(conditions) = entry.scores.get("conditions") else { continue };
+        let text = |key: &str| conditions.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
         let score = |key: &str, digits: usize| {
             entry.scores.get(key).and_then(Value::as_f64).map(|x| format!("{x:.digits$}")).unwrap_or_default()
         };
         let cells = [
             text("split"),
-            background(&told["background"]),
+            background(&conditions["background"]),
             grouped(entry.step),
             score("PSNR", 2),
             score("PSNR-cc", 2),
@@ -427,9 +427,9 @@ fn costs(out: &mut String, run: &Run) {
 
 fn again(out: &mut String, run: &Run) {
     let mut lines = String::new();
-    if let Some(told) = compress::told(run) {
-        let level = told.level.map(|l| format!(" --level {l}")).unwrap_or_default();
-        let _ = writeln!(lines, "splat4d compress {}{level} -o NEW_RUN", in_command(&told.source));
+    if let Some(compressed) = compress::compressed(run) {
+        let level = compressed.level.map(|l| format!(" --level {l}")).unwrap_or_default();
+        let _ = writeln!(lines, "splat4d compress {}{level} -o NEW_RUN", in_command(&compressed.source));
         lines += "# all settings: compress.toml\n";
     } else if let Some(capture) = run.capture() {
         let _ = writeln!(

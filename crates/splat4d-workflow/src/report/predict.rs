@@ -68,32 +68,32 @@ pub struct ModelScores {
 }
 
 /// Writes the page and returns its path. `films`: camera and file.
-pub fn write(folder: &Path, run: &str, told: &Summary, films: &[(String, PathBuf)]) -> Result<PathBuf> {
+pub fn write(folder: &Path, run: &str, summary: &Summary, films: &[(String, PathBuf)]) -> Result<PathBuf> {
     let path = folder.join("report.html");
-    files::write(&path, page(run, told, films).as_bytes())?;
+    files::write(&path, page(run, summary, films).as_bytes())?;
     Ok(path)
 }
 
-fn page(run: &str, told: &Summary, films: &[(String, PathBuf)]) -> String {
+fn page(run: &str, summary: &Summary, films: &[(String, PathBuf)]) -> String {
     let mut body = String::new();
     let words = format!(
         "{} frames observed, {} predicted, {} of them with images · {} nodes on {} moving Gaussians · the exported \
          scene uses {}",
-        told.observed_frames,
-        told.horizon,
-        told.pictured,
-        told.nodes,
-        files::grouped(told.moving_gaussians),
-        told.scene
+        summary.observed_frames,
+        summary.horizon,
+        summary.pictured,
+        summary.nodes,
+        files::grouped(summary.moving_gaussians),
+        summary.scene
     );
     let _ = writeln!(body, "<header><h1>{}, predicted</h1><p>{}</p></header>", escape(run), escape(&words));
-    if told.pictured < told.horizon {
-        let beyond = told.horizon - told.pictured;
+    if summary.pictured < summary.horizon {
+        let beyond = summary.horizon - summary.pictured;
         let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no image to compare with.</p>");
     }
-    let all: Vec<&ModelScores> = told.models.iter().chain(&told.assimilated).chain(&told.oracle).collect();
-    table(&mut body, &all, told.models.len());
-    let seconds = |i: usize| (i + 1) as f64 / told.fps;
+    let all: Vec<&ModelScores> = summary.models.iter().chain(&summary.assimilated).chain(&summary.oracle).collect();
+    table(&mut body, &all, summary.models.len());
+    let seconds = |i: usize| (i + 1) as f64 / summary.fps;
     let series = |of: &dyn Fn(&ModelScores) -> Vec<Option<f64>>| -> Vec<Series> {
         let one = |m: &&ModelScores| Series {
             name: m.name.clone(),

@@ -1,4 +1,4 @@
-//! How far training moved cameras and clocks: in one line, and as a section of the report.
+//! Corrections of poses, focal lengths and time offsets by training: in one line, and as a section of the report.
 
 use super::chart::escape;
 use crate::run_folder::Run;
@@ -6,7 +6,7 @@ use serde_json::Value;
 use splat4d_train::run::corrected;
 use std::fmt::Write;
 
-/// How far cameras moved, in one line; `None`: nothing was learnt of them.
+/// Corrections of cameras, in one line; `None`: no camera was refined.
 pub fn refined_in_words(refined: &Value) -> Option<String> {
     let rows = refined["cameras"].as_array()?;
     let number = |row: &Value, key: &str| row[key].as_f64().unwrap_or(0.0).abs();
@@ -53,7 +53,7 @@ pub fn refined_in_words(refined: &Value) -> Option<String> {
     (!words.is_empty()).then(|| format!("refined: {}", words.join("; ")))
 }
 
-/// How far cameras were moved, those that went furthest first.
+/// Corrections of cameras, largest first.
 pub(super) fn section(out: &mut String, run: &Run) {
     // A damaged file was reported when the run was measured.
     let Some(refined) = corrected::read(&run.path).ok().flatten() else { return };

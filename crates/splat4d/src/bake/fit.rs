@@ -246,18 +246,21 @@ fn tail(samples: &[FrameSample]) -> Option<(Envelope, f64)> {
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
     let peak = samples.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
     let share = |l: &FrameSample| l.alpha / peak.alpha;
-    let told: Vec<[f64; 3]> = samples
+    let weighted: Vec<[f64; 3]> = samples
         .iter()
         .filter(|l| TELLING.contains(&share(l)))
         .map(|l| [(l.time - peak.time).abs(), (-2.0 * share(l).ln()).sqrt(), share(l)])
         .collect();
-    let total: f64 = told.iter().map(|t| t[2]).sum();
-    let mean = |k: usize| told.iter().map(|t| t[2] * t[k]).sum::<f64>() / total;
+    let total: f64 = weighted.iter().map(|t| t[2]).sum();
+    let mean = |k: usize| weighted.iter().map(|t| t[2] * t[k]).sum::<f64>() / total;
     let (x, y) = (mean(0), mean(1));
-    let spread: f64 = told.iter().map(|t| t[2] * (t[0] - x).powi(2)).sum();
+    let spread: f64 = weighted.iter().map(|t| t[2] * (t[0] - x).powi(2)).sum();
     // Through the strongest sample, where there is but one other.
-    let slope =
-        if spread > 0.0 { told.iter().map(|t| t[2] * (t[0] - x) * (t[1] - y)).sum::<f64>() / spread } else { y / x };
+    let slope = if spread > 0.0 {
+        weighted.iter().map(|t| t[2] * (t[0] - x) * (t[1] - y)).sum::<f64>() / spread
+    } else {
+        y / x
+    };
     let half = (x - y / slope).max(0.0);
     let softness = if half > 0.0 { 1.0 / slope } else { x / y };
     let sound = softness.is_finite() && softness > 0.0 && half.is_finite();

@@ -1,4 +1,4 @@
-//! Every kind of lifespan as the file's one envelope.
+//! Converts every kind of lifespan to the envelope of the playback file.
 
 use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};

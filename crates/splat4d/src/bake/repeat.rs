@@ -5,7 +5,7 @@ use super::fit::LEVEL_PIXELS;
 use super::sampling::Viewpoints;
 use crate::format::playback::{Node, Primitive};
 
-/// How a clip is repeated.
+/// Repetition of a clip.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rounds {
     /// First second of the clip.

@@ -11,7 +11,7 @@ use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Key};
 
-/// How a straight layer moves.
+/// Motion of a layer that moves linearly.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Line {
     velocities: Option<Key>,

@@ -1,10 +1,10 @@
 //! How strongly images react to an error of each Gaussian, measured on renders of the model.
 //!
-//! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign
-//! may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian
-//! alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a Gaussian
-//! counts when that camera sees it. A Gaussian that no render sees keeps a share of the weight that its size and
-//! opacity give, so that it is not lost for other views.
+//! A Gaussian behind a wall, or one with its neighbours' colour, may be off by pixels without a visible effect; the
+//! edge of a sign may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each
+//! Gaussian alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a
+//! Gaussian counts when that camera sees it. A Gaussian that no render sees keeps a share of the weight that its size
+//! and opacity give, so that it is not lost for other views.
 
 use super::sample::GEOMETRY;
 use super::sampling::Viewpoints;

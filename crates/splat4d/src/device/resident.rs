@@ -8,7 +8,7 @@ use crate::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
 /// A layer that a device can keep: its motion and its tables in the order of [`KEPT`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResidentMotion {
-    /// How its rows move.
+    /// Motion of its rows.
     pub moves: Moves,
     /// Its tables.
     pub keys: [Option<Key>; KEPT],

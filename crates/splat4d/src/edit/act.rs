@@ -25,8 +25,9 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         let selected = select(&Expr::parse(text)?, scene, context)?;
         let count = selected.iter().flatten().filter(|s| **s).count();
         match count {
-            0 => Err(Error::input(format!("the selection `{text}` is empty"))
-                .remedy("See how many it holds with --count, and over time")),
+            0 => {
+                Err(Error::input(format!("the selection `{text}` is empty")).remedy("Count its Gaussians with --count"))
+            }
             _ => Ok((selected, count)),
         }
     };

@@ -28,7 +28,7 @@ pub(super) fn window(layer: &Layer<f32>, [from, to]: [f64; 2]) -> Option<Layer<f
     Some(out)
 }
 
-/// How many of the layer's Gaussians [`window`] keeps.
+/// Number of the layer's Gaussians that [`window`] keeps.
 pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
     let span = [layer.span[0].max(from), layer.span[1].min(to)];
     if span[0] >= span[1] {
@@ -117,7 +117,7 @@ fn retimed(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f
 /// A clock around the model, which must not read the lifespans that are about to change.
 fn clocked(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f32>) -> Result<Arc<dyn Motion>> {
     if reads_lifespans(motion.as_ref()) && layer.params[LIFE].width() > 0 {
-        return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot run on another clock", layer.name))
+        return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot be retimed", layer.name))
             .remedy("Bake the scene first; baked scenes can"));
     }
     Ok(Arc::new(Edited::around(motion.clone(), Change::Clock { rate, offset }, &mut layer.params)?))

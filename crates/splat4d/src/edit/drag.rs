@@ -72,10 +72,13 @@ impl DragRequest<'_> {
     fn check_time(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
         if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
-            return bad(format!("{} s is not in the clip", self.at), "Give a second of the clip as `at`");
+            return bad(format!("{} s is outside the clip", self.at), "Give a second of the clip as `at`");
         }
         if self.nodes != 0 && !(2..=MOST_TIMES * PULLING).contains(&self.nodes) {
-            return bad(format!("{} nodes", self.nodes), "Give 2 to 1024, or 0 for those that the model has");
+            return bad(
+                format!("invalid number of nodes {}", self.nodes),
+                "Give 2 to 1024, or 0 for those that the model has",
+            );
         }
         Ok(())
     }
@@ -91,7 +94,7 @@ impl DragRequest<'_> {
         };
         if self.handles.is_empty() || !self.handles.iter().all(sound) {
             return bad(
-                "a drag needs handles, each with keys whose times rise".into(),
+                "a drag needs handles, each with keys in ascending order of time".into(),
                 "Write handles = [{ place = [0, 0, 1], keys = [{ t = 0.0, by = [0, 0, 0] }, { t = 1.0, by = [0, 0, 1] }] }]",
             );
         }
@@ -329,10 +332,8 @@ fn carried(
         return Ok((start, paths));
     }
     let Some(layer) = own_nodes(scene, selected) else {
-        return Err(Error::input(
-            "what is selected has no control nodes of its own, or is of several layers that have",
-        )
-        .remedy("Give nodes = 512, or select one layer that a model on control nodes moves"));
+        return Err(Error::input("the selection has no control nodes, or belongs to several layers that have some")
+            .remedy("Give nodes = 512, or select one layer that a model on control nodes moves"));
     };
     let at = |t: &f64| {
         let seen = Evaluation::of_layer(layer, Space::Nodes, Rows::All, Time(*t));
@@ -369,7 +370,7 @@ fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &DragRequest<'_>) -> Re
     let found: Vec<[f64; 3]> =
         farthest_points(&table, asked.nodes).into_iter().map(|x: [f32; 3]| x.map(f64::from)).collect();
     if found.len() < 2 {
-        return Err(Error::input(format!("nothing of the selection can be seen at {} s", asked.at))
+        return Err(Error::input(format!("no Gaussian of the selection is visible at {} s", asked.at))
             .remedy("Give another `at`, or another selection"));
     }
     Ok(found)

@@ -270,7 +270,7 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, samples: &SceneSamples, context: &d
         Expr::Like(place, least) => chosen(&alike(scene, samples, *place, *least)?),
         Expr::At(t, inner) => {
             if !(scene.clip[0]..=scene.clip[1]).contains(t) {
-                return Err(Error::input(format!("{t} s is not in the scene's clip"))
+                return Err(Error::input(format!("{t} s is outside the scene's clip"))
                     .remedy(format!("It goes from {} to {} s", scene.clip[0], scene.clip[1])));
             }
             let then = SceneSamples::at(scene, inner, *t);

@@ -77,7 +77,7 @@ pub struct Place {
     pub shift: [f64; 3],
     /// Axis and degrees, right-handed.
     pub turn: Option<[f64; 4]>,
-    /// How many times as large.
+    /// Scale factor.
     pub scale: Option<f64>,
     /// The fixed point of turning and scaling, scene units; the origin unless stated.
     pub about: Option<[f64; 3]>,
@@ -93,7 +93,7 @@ pub struct PlaceKey {
     pub shift: [f64; 3],
     /// Axis and degrees, right-handed.
     pub turn: Option<[f64; 4]>,
-    /// How many times as large.
+    /// Scale factor.
     pub scale: Option<f64>,
     /// Whether the motion eases in and out.
     #[serde(skip_serializing_if = "std::ops::Not::not")]

@@ -162,7 +162,7 @@ impl Expr {
         let expr = parser.either()?;
         match parser.peek() {
             None => Ok(expr),
-            Some(t) => Err(parser.wrong(&format!("`{t}` is too much"))),
+            Some(t) => Err(parser.wrong(&format!("unexpected `{t}` after the end"))),
         }
     }
 
@@ -201,7 +201,7 @@ impl fmt::Display for Token {
 
 fn unreadable(text: &str, what: &str) -> Error {
     Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
-        "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
+        "A selection is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
          size(from,to), life(from,to), speed(from,to), layer(name), label(name), like(x,y,z, cosine), mask(file, camera), subject, \
          lasso(...), visible(...), all, at(t, ...), \
          ever(...), always(...), grow(..., distance), and, or, not and parentheses",
@@ -505,7 +505,7 @@ mod tests {
             ("bux(1)", "bux"),
             ("box(1,2,3)", "6 numbers"),
             ("box(1,2,3,4,5,6", "missing"),
-            ("all all", "too much"),
+            ("all all", "unexpected"),
             ("sphere(0,0,0,nan)", "4 numbers"),
             ("layer('x", "quotation"),
             ("grow(all, 0)", "above 0"),

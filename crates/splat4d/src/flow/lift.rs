@@ -1,4 +1,4 @@
-//! From flow in images back to flow in space with one camera's depth; integration over frames and how far it drifts.
+//! Lifts optical flow to scene flow with one camera's depth; integrates it over frames and measures the drift.
 //!
 //! One camera cannot observe motion along its rays: with the depth of one frame alone ([`lift_in_plane`]) that part is
 //! left out, with both frames' depths ([`lift`]) it is there.
@@ -20,7 +20,7 @@ pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f6
     lift(camera, camera, pixel, flow, depth, depth)
 }
 
-/// How a field of velocities is followed.
+/// Integration method of a velocity field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Integrator {
     /// x + h·v(x): its error grows by (1 + ω²h²)^½ a step on a rotation.

@@ -1,11 +1,11 @@
-//! Points that are requested and followed: a pixel of an image, or a position in the world, through all times, with
-//! what a camera sees of it.
+//! Follows requested points, a pixel of an image or a position in the world, through all times, with their visibility
+//! in a camera.
 //!
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which
 //! half of the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its
-//! point is on the pixel's ray at that depth. A position belongs to the Gaussians nearest to it. They carry the point
-//! on by their mean displacement; where half of them have died, the nearest ones that are still alive take over, so
-//! that points are followed through models with short lifespans, at the price of the drift of an integration.
+//! point is on the pixel's ray at that depth. A position belongs to the Gaussians nearest to it. Their mean
+//! displacement moves the point; where half of them have ended, the nearest living ones replace them, so that points
+//! are followed through models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};

@@ -1,7 +1,7 @@
 //! Tracks: where chosen Gaussians are over time, for any motion model, as data and as JSON or CSV text.
 //!
-//! A track is as honest as its Gaussian is lasting: a model whose Gaussians are born and die gives short ones, and
-//! times at which a Gaussian is not alive have no position.
+//! A track is as long as the lifespan of its Gaussian: models with short lifespans give short tracks, and times at
+//! which a Gaussian is not alive have no position.
 
 use crate::layers::{Evaluation, Scene};
 use crate::math::Real;

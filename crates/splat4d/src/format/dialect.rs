@@ -38,7 +38,7 @@ pub struct Dialect {
     pub mark: Option<fn(&[u8]) -> bool>,
     /// Reads a file; [`Dialect::open`] states which way is up.
     pub read: fn(&[u8]) -> Result<Opened>,
-    /// How it is written.
+    /// Writer.
     pub writer: Writer,
     /// Whether it can be written with positions of the world, in double precision ([`WriteOptions::world`]).
     pub world: bool,
@@ -334,10 +334,10 @@ mod tests {
             for bad in [f32::NAN, f32::INFINITY] {
                 let (mut scene, mut bytes) = (sample(dialect.moves), Vec::new());
                 scene.layers[0].params[GEOMETRY].set(7, 1, bad);
-                let told = dialect.write(&scene, &WriteOptions::default(), &mut bytes).unwrap_err().to_string();
+                let message = dialect.write(&scene, &WriteOptions::default(), &mut bytes).unwrap_err().to_string();
                 assert!(
-                    told.contains("finite") && told.contains("Gaussian 7") && bytes.is_empty(),
-                    "{dialect:?}: {told}"
+                    message.contains("finite") && message.contains("Gaussian 7") && bytes.is_empty(),
+                    "{dialect:?}: {message}"
                 );
             }
         }

@@ -47,7 +47,7 @@ fn is_ksplat(bytes: &[u8]) -> bool {
     bytes.starts_with(&VERSION) && Header::read(bytes).is_ok_and(|h| h.rows > 0 && h.rows <= bytes.len() / 24)
 }
 
-/// What the header states about all sections.
+/// Header fields that apply to all sections.
 struct Header {
     sections: usize,
     rows: usize,

@@ -53,7 +53,7 @@ impl Mended {
     /// Reports it.
     pub(super) fn report(&self, of: usize, warnings: &mut Warnings) {
         warnings.counted(self.opaque, of, "have opacity +infinity: they are opaque");
-        warnings.counted(self.invisible, of, "have opacity -infinity: their alpha is 0, they are never seen");
+        warnings.counted(self.invisible, of, "have opacity -infinity: their alpha is 0, they are never visible");
         warnings.counted(self.flat, of, "have a scale of -infinity: they are flat");
     }
 }

@@ -11,7 +11,7 @@ use std::io::Write;
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// The writer pads its header so that the data begins at a multiple of this (NumPy's ARRAY_ALIGN).
 const ALIGN: usize = 64;
-/// Longest header that is believed; NumPy itself refuses headers above 10,000 bytes.
+/// Longest header that is accepted; NumPy itself refuses headers above 10,000 bytes.
 const MAX_HEADER: usize = 1 << 16;
 /// Longest array of an archive that is inflated, bytes: as long as a file may be that is not compressed.
 const MAX_MEMBER: usize = 512 << 20;
@@ -97,7 +97,7 @@ impl Npy {
         Self::read(&file?)
     }
 
-    /// How many numbers the array holds.
+    /// Number of elements.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         match &self.values {

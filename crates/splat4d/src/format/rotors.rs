@@ -112,7 +112,7 @@ impl Tuple<'_> {
     fn shape(&self, i: usize) -> Result<&[usize]> {
         match self.entries[i] {
             Value::Tensor(tensor) => Ok(&tensor.shape),
-            _ => Err(Error::input(format!("entry {i} of the checkpoint is no tensor")).remedy("Save it again.")),
+            _ => Err(Error::input(format!("entry {i} of the checkpoint is not a tensor")).remedy("Save it again.")),
         }
     }
 

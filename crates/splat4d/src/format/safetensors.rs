@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::Write;
 
-/// Longest header that is believed, as in the reference implementation.
+/// Longest header that is accepted, as in the reference implementation.
 const MAX_HEADER: usize = 100_000_000;
 /// The header's key for free text.
 const METADATA: &str = "__metadata__";

@@ -116,14 +116,14 @@ pub fn spec_from_json(v: &Value) -> Result<Spec> {
         }
         return Err(Error::new(
             ErrorKind::Unsupported,
-            format!("the scene moves by `{model}`, a motion model of another program"),
+            format!("the scene uses `{model}`, a motion model of another program"),
         )
         .remedy("Open it in the program that registers this model (Python: `motion=`), or open the baked .s4d file"));
     }
     if !BUILT_IN.contains(&model.as_str()) {
         return Err(Error::new(
             ErrorKind::Unsupported,
-            format!("the scene moves by `{model}`, which this version does not support"),
+            format!("the scene uses the motion model `{model}`, which this version does not support"),
         )
         .remedy("Open it with the splat4d that wrote it, or a newer one"));
     }
@@ -265,7 +265,7 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
     Ok(scene)
 }
 
-/// How blended channels become colour; files without it have no head.
+/// Mapping from blended channels to colour; files without it have no head.
 fn head(meta: &Value) -> Result<Head> {
     if meta["head"].is_null() {
         return Ok(Head::Identity);

@@ -25,7 +25,7 @@ pub fn join(frames: &[Params], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
 /// Errors, panics: as [`join`]. Panics: there are more or fewer numbers than frames.
 pub fn join_at(frames: &[Params], numbers: &[u64], fps: f64, up: [f64; 3]) -> Result<Scene<f32>> {
     assert_eq!(frames.len(), numbers.len(), "every frame has a number");
-    assert!(fps > 0.0 && fps.is_finite(), "a sequence needs a positive number of frames a second, not {fps}");
+    assert!(fps > 0.0 && fps.is_finite(), "a sequence needs a positive number of frames per second, not {fps}");
     if frames.is_empty() {
         return Err(Error::input("a sequence needs at least one frame").remedy("Give a folder with numbered files."));
     }

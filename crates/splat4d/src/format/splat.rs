@@ -34,8 +34,11 @@ const SMALLEST_SCALE: f32 = 1e-30;
 /// Reads Gaussians. Errors: the length is not a multiple of 32, or there is nothing.
 pub fn read(bytes: &[u8]) -> Result<(Params, Warnings)> {
     if bytes.is_empty() || !bytes.len().is_multiple_of(ROW) {
-        return Err(Error::input(format!("a .splat file has 32 bytes a Gaussian, this one has {} bytes", bytes.len()))
-            .remedy("It is cut short, or no .splat file; copy or export it again."));
+        return Err(Error::input(format!(
+            "a .splat file has 32 bytes per Gaussian, this one has {} bytes",
+            bytes.len()
+        ))
+        .remedy("It is truncated, or not a .splat file; copy or export it again."));
     }
     let mut params = Params::new(bytes.len() / ROW, 1, &[]);
     let mut warnings = Warnings::default();

@@ -180,7 +180,7 @@ impl State {
         })
     }
 
-    /// These Gaussians as they are.
+    /// These Gaussians, unchanged.
     fn params(&self, rows: &[usize]) -> Params {
         let mut params = Params::new(rows.len(), 1, &[]);
         const { assert!(QUAT == 3, "a pose is position and rotation") };

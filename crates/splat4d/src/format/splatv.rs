@@ -39,7 +39,7 @@ pub(crate) const MAGIC: [u8; 4] = 0x674Bu32.to_le_bytes();
 const ROW: usize = 64;
 /// Texels a row of the texture, 16 bytes each: the players' shaders compute with 1024 Gaussians a row.
 const TEXTURE_WIDTH: usize = 4096;
-/// Longest JSON text that is believed: a thousand cameras take a third of this.
+/// Longest JSON text that is accepted: a thousand cameras take a third of this.
 const MOST_JSON: usize = 1 << 20;
 /// Smallest linear scale: f16 ends at 6e-8.
 const SMALLEST_SCALE: f32 = 6e-8;

@@ -16,7 +16,7 @@ use std::collections::HashMap;
 const PICKLE: &str = "data.pkl";
 /// Longest pickle that is read: names and shapes alone; a network of a million tensors has less.
 const MOST_PICKLE: usize = 64 << 20;
-/// Most axes of a tensor that is believed.
+/// Most axes of a tensor that is accepted.
 const MOST_AXES: usize = 16;
 
 /// Functions that a pickle may call. All of them make plain data.

@@ -1,4 +1,4 @@
-//! Records stages and states how long each took: by the GPU's own clock, or by the wall with a wait after each stage.
+//! Measures the time of stages: by GPU timestamps, or by wall time with a wait after each stage.
 
 use super::device::Gpu;
 use crate::Result;

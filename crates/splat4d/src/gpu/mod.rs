@@ -104,7 +104,7 @@ pub struct GpuRenderer {
     drawn: Vec<(Band, usize)>,
     returned: Returned,
     pictures: Pictures,
-    /// How a camera shows what is rendered, where no tables stay.
+    /// Colour matrix of the camera, where no tables stay.
     response: Grown,
     resident: Option<Box<KeptTables>>,
     flights: Flights,

@@ -1,4 +1,4 @@
-//! The images that are compared with, kept on the GPU within a budget of bytes.
+//! Ground-truth images, cached on the GPU within a byte budget.
 
 use super::buffers::Grown;
 use super::device::Gpu;

@@ -1,6 +1,5 @@
-//! Tables that stay on the GPU: rows become splats, splats an image, and its loss steps of Adam, without a number of
-//! them passing through the CPU. Densification, files and other readers of a scene fetch the tables, and hand them
-//! back.
+//! Tables that stay on the GPU: motion, rendering, loss and Adam run there without a transfer to the CPU.
+//! Densification, files and other readers of a scene download the tables and upload their changes.
 //!
 //! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own;
 //! every row has a thread to itself, so that pages change no bit of the tables.

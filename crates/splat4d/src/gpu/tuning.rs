@@ -1,5 +1,5 @@
-//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so,
-//! last bits: a sweep on a GPU varies them.
+//! Performance constants of the kernels, which a sweep on a GPU varies. They do not change results, except for the last
+//! bits where stated.
 
 use super::limits::THREADS;
 

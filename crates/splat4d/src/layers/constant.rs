@@ -1,6 +1,5 @@
 //! A dynamic scene with the same Gaussians in the same order at every time: what programs need that interpolate between
-//! frames, blur by motion or encode differences. A Gaussian stays where it was first or last seen while it does not
-//! live.
+//! frames, blur by motion or encode differences. Outside its lifespan, a Gaussian stays at its first or last position.
 
 use super::{Layer, Scene, freeze_rows};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! The lifespan of a layer's Gaussians as loops over lanes: who is alive, the envelope, and its backward pass.
+//! Lifespans of a layer's Gaussians as loops over lanes: active set, envelope, and backward pass.
 
 use super::ALPHA_MIN;
 use crate::math::Real;

@@ -127,7 +127,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// How many distinct queries were queried.
+    /// Number of distinct queries.
     pub fn len(&self) -> usize {
         self.queries.len()
     }

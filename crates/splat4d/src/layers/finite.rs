@@ -1,4 +1,4 @@
-//! The one check in front of all writers: no file ever holds NaN or infinity.
+//! Checks scenes before all writers: no file stores NaN or infinity.
 
 use super::{Layer, Scene};
 use crate::math::Rng;

@@ -1,4 +1,4 @@
-//! A moving scene at one time as plain Gaussians: what a 3DGS file can hold.
+//! Evaluates a dynamic scene at one time as static Gaussians, as 3DGS files store them.
 
 use super::{Evaluation, Layer, LayerTape, Scene};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! Static Gaussians mirrored along an axis: what it takes to enter a left-handed program.
+//! Mirrors static Gaussians along an axis, for left-handed programs.
 
 use crate::scene::params::QUAT;
 use crate::scene::{GEOMETRY, Params, SH};

@@ -50,7 +50,7 @@ pub struct Layer<F: Real = f32> {
     pub name: String,
     /// All learnable state.
     pub params: Params<F>,
-    /// How it moves.
+    /// Its motion.
     pub motion: Arc<dyn Motion<F>>,
     /// Lifespans of its Gaussians.
     pub life: LifeKind,
@@ -218,7 +218,7 @@ impl<F: Real> Layer<F> {
 
     /// Life of every row: centre, log width, log softness (seconds; columns that the kind lacks are zero).
     /// The model's own where it has one, otherwise the layer's.
-    pub fn lives(&self) -> (LifeKind, Vec<[f64; 3]>) {
+    pub fn lifespans(&self) -> (LifeKind, Vec<[f64; 3]>) {
         let mut own = Table::new(&[("life", 2)], 0);
         let (table, kind) = if self.motion.life(&self.params, &mut own) {
             (&own, LifeKind::GaussHalf)
@@ -231,7 +231,7 @@ impl<F: Real> Layer<F> {
     /// [from, to] in seconds for every row: when its opacity times life is at least [`ALPHA_MIN`] within the layer's
     /// span; (1, 0) for never.
     pub fn spans(&self) -> Vec<[f64; 2]> {
-        let (kind, rows) = self.lives();
+        let (kind, rows) = self.lifespans();
         let geometry = &self.params[GEOMETRY];
         // The span's end is not part of it, but an interval's is.
         let end = if self.span[1].is_finite() { self.span[1].next_down() } else { self.span[1] };
@@ -379,7 +379,7 @@ fn life_row<F: Real>(table: &Table<F>, id: usize) -> [F; 3] {
     }
 }
 
-/// How blended channels become colour.
+/// Mapping from blended channels to colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Head {
@@ -422,7 +422,7 @@ pub struct Scene<F: Real = f32> {
     /// World coordinates of the scene's origin ([`scene::offset`](crate::scene::offset)): add it to positions of the
     /// scene for those of the world that its capture or file is in. Zero unless they are far from the origin.
     pub offset: [f64; 3],
-    /// How blended channels become colour.
+    /// Mapping from blended channels to colour.
     pub head: Head,
     /// Names of the labels that its Gaussians have logits for ([`scene::labels`](crate::scene::labels)); empty: none.
     pub labels: Vec<String>,

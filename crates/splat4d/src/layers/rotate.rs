@@ -1,4 +1,4 @@
-//! A whole scene rotated in space, and its colours simplified: what it takes to move between programs' axes.
+//! Rotates a whole scene, and lowers its SH degree: for conversion between programs' axes.
 
 use super::Scene;
 use crate::math::{Sim3, quat, se3, sh};

@@ -44,7 +44,7 @@ pub fn similarity(from: &[[f64; 3]], to: &[[f64; 3]]) -> Option<Sim3> {
     Some(Sim3 { scale, rotation, translation: std::array::from_fn(|k| there[k] - scale * turned[k]) })
 }
 
-/// How far a camera is from its truth.
+/// Error of a camera pose against the truth.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Apart {
     /// Of the rotations, degrees.

@@ -1,4 +1,4 @@
-//! [`Real`]: f32 for work, f64 for proof.
+//! [`Real`]: f32 for computation, f64 for gradient checks.
 
 use std::f32::consts::{FRAC_1_SQRT_2, LN_2};
 use std::fmt::{Debug, Display};

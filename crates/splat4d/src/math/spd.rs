@@ -8,10 +8,10 @@
 //! | exp | ΓΣ₁ + Σ₁Γ = V; μ₁ + v, (I+Γ)Σ₁(I+Γ) |
 //! | geodesic | (1−s)μ₁ + sμ₂, MΣ₁M with M = (1−s)I + sT |
 //!
-//! No gradient is propagated through eigenvectors, which jump where eigenvalues meet: roots and maps are differentiated
-//! through the equations they solve. All is in f64: one Gaussian is some hundred operations in registers, and products
-//! of two nearly flat covariances have condition numbers that 32 bits cannot hold. What was stored in 32 bits is
-//! widened.
+//! No gradient is propagated through eigenvectors, which are discontinuous where eigenvalues are equal: roots and maps
+//! are differentiated through the equations they solve. All is in f64: one Gaussian is some hundred operations in
+//! registers, and products of two nearly flat covariances have condition numbers that 32 bits cannot hold. What was
+//! stored in 32 bits is widened.
 //!
 //! Source: Deng et al. 2024 (Wasserstein 4DGS); Malagò et al. 2018, "Wasserstein Riemannian geometry of Gaussian
 //! densities", for log, exp and Lyapunov's equation.

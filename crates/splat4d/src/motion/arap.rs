@@ -46,7 +46,7 @@ pub struct Handle {
 pub struct Dragged {
     /// Current positions of the nodes.
     pub positions: Vec<[f64; 3]>,
-    /// How every node has turned (rows).
+    /// Rotation of every node (rows).
     pub rotations: Vec<[[f64; 3]; 3]>,
     /// E at the start (all nodes follow the handles as one rigid body) and after every iteration.
     pub energies: Vec<f64>,

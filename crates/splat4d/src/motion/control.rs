@@ -27,7 +27,7 @@ const MAX_BASES: usize = 256;
 /// Most numbers of one table of a trajectory: a bound for files (2^24 numbers are 64 MiB).
 const MAX_NUMBERS: usize = 1 << 24;
 
-/// How keys in time become a curve.
+/// Interpolation of keys in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Curve {
@@ -46,14 +46,14 @@ pub enum Curve {
 pub enum TrajectorySpec {
     /// Every node has its own poses at keys in time.
     Keys {
-        /// How they become a curve.
+        /// Interpolation.
         curve: Curve,
-        /// How many, at least two, and four of a cubic curve.
+        /// Number of keys, at least two; at least four for a cubic curve.
         keys: usize,
     },
     /// Nodes mix few motions that all share (DynMF: Kratimenos et al. 2024).
     LowRank {
-        /// How many motions, 1 to 256.
+        /// Number of motions, 1 to 256.
         bases: usize,
         /// Keys of each, of a cubic curve: at least four.
         keys: usize,

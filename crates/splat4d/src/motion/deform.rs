@@ -100,7 +100,7 @@ impl Model for DeformSpec {
     }
 }
 
-/// How x̂ and t̂ reach the trunk.
+/// Encoding of x̂ and t̂ for the trunk.
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // one a model
 enum Eyes {

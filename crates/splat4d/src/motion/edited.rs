@@ -1,5 +1,5 @@
-//! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed position,
-//! other colours, a fade, a drag of control nodes. Changes on changes are models around models.
+//! `edited`: any model with a change that its own tables cannot represent: another clock, a key-framed position, other
+//! colours, a fade, a drag of control nodes. Changes on changes are models around models.
 //!
 //! | change | result at t, from the inner result |
 //! |---|---|
@@ -155,7 +155,7 @@ pub(crate) struct Edited<F: Real = f32> {
     drag: Option<drag::Keys>,
 }
 
-/// How a result is placed at one time.
+/// Similarity applied to a result at one time.
 enum Placed<'a, F> {
     Same,
     All(Affine<F>),

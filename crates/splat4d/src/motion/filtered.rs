@@ -51,9 +51,9 @@ pub const GAINS: &str = "filter_gains";
 pub struct FilteredSpec {
     /// The model inside; never a filter itself.
     pub inner: Box<Spec>,
-    /// How prediction and observation become one.
+    /// Fusion of prediction and observation.
     pub fusion: Fusion,
-    /// How the prediction is made.
+    /// Method of prediction.
     pub predictor: Predictor,
     /// Share of the observation that Gaussians start with, above 0 and below 1 (geodesic fusion).
     pub gain: f64,
@@ -168,7 +168,7 @@ impl<F: Real> Filtered<F> {
         &self.spec
     }
 
-    /// How far predictions count at t, and its slope.
+    /// Weight of predictions at t, and its slope.
     fn trust(&self, t: f64) -> [f64; 2] {
         let x = (t - self.spec.start) / self.spec.frame - self.spec.baseline as f64;
         if x > 0.0 && x < 1.0 { [x, 1.0 / self.spec.frame] } else { [x.clamp(0.0, 1.0), 0.0] }

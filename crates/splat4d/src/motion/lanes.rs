@@ -12,7 +12,7 @@ use crate::simd::{Kernel, Simd, dispatch, each, total};
 /// One number of sixteen rows.
 pub(crate) type Lane<F> = [F; BLOCK];
 
-/// How the rows of a batch are in a table.
+/// Layout of a batch's rows in a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Lie {
     /// They are one block.

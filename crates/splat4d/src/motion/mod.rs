@@ -53,7 +53,7 @@ pub struct At<'a, F = f32> {
 }
 
 impl<F: Real> At<'_, F> {
-    /// How many splats are requested.
+    /// Number of requested splats.
     pub fn len(&self) -> usize {
         self.rows.len(self.p.rows_of(self.of))
     }

@@ -213,7 +213,7 @@ impl Skin {
         out.fill(self, p);
     }
 
-    /// How many nodes there are.
+    /// Number of nodes.
     pub fn count<F: Real>(&self, p: &Params<F>) -> usize {
         p[self.nodes].rows()
     }

@@ -74,7 +74,7 @@ pub enum Equivariance {
 pub struct SsmSpec {
     /// Seed of what starts at random.
     pub seed: u64,
-    /// How Gaussians follow nodes.
+    /// Skinning of Gaussians to nodes.
     pub skin: SkinSpec,
     /// First and last tick, seconds.
     pub clip: [f64; 2],

@@ -31,7 +31,7 @@ const PAGES: &str = "poses";
 pub const FOREGROUND: &str = "foreground_logits";
 /// Cameras that must see every time: with two, what moves along a line between them is not seen to move.
 pub const LEAST_CAMERAS: usize = 3;
-/// Most frames of a file that is believed: some nine hours at 30 a second.
+/// Most frames of a file that is accepted: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
 /// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification requests more has
 /// lost its arrays.

@@ -96,7 +96,7 @@ pub(crate) struct Warp {
     network: Mlp,
 }
 
-/// What the network gives at the times of a step, [nodes, outputs] each.
+/// Outputs of the network at the times of a step, [nodes, outputs] each.
 struct Passes<F>(Vec<(Time, Vec<F>)>);
 
 impl<F> Default for Passes<F> {

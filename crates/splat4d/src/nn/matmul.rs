@@ -1,4 +1,4 @@
-//! Matrix products on one thread, in f32 and f64: the one door to `gemm`'s kernels, with every bound checked.
+//! Matrix products on one thread, in f32 and f64: the only interface to `gemm`'s kernels, with every bound checked.
 //!
 //! `gemm-f32` and `gemm-f64` are the two parts of `gemm` that are used: the crate of that name also builds its kernels
 //! for complex numbers and half floats, which is a third of a clean build of everything that is not ours.

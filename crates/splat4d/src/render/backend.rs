@@ -1,6 +1,5 @@
-//! The seam between a scene and whatever renders it: [`Backend`], implemented by the renderer of the CPU, by the oracle
-//! and (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command name none of them
-//! directly.
+//! Interface between a scene and its renderers: [`Backend`], implemented by the renderer of the CPU, by the oracle and
+//! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command name none of them directly.
 
 use super::compare::{Comparison, Target};
 use super::resident::Resident;

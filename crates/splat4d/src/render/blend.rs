@@ -6,9 +6,9 @@
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
 //!
-//! Backward walks in the same order as forward, so that it meets the same α, T and stops: what is behind a splat is
-//! what the image holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
-//! last splat of a pixel, which would cost the forward pass two memory accesses a pixel and splat.
+//! Backward walks in the same order as forward, so that it meets the same α, T and stops: the colour behind a splat is
+//! the pixel's colour minus the sum up to it (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the last
+//! splat of a pixel, which would cost the forward pass two memory accesses a pixel and splat.
 
 #[cfg(test)]
 mod tests;

@@ -1,6 +1,6 @@
 //! The definition of an image: plain loops in f64, every splat against every pixel, matrices written out.
 //!
-//! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
+//! Shares no code with the fast path but the spherical-harmonics constants. For tests and golden images.
 
 use super::backend::{Abilities, Backend, Shot, refusal};
 use super::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads};

@@ -1,4 +1,4 @@
-//! The seam between a scene that learns and a device that keeps its tables: [`Resident`].
+//! Interface between a scene in training and a device that keeps its tables: [`Resident`].
 
 use super::compare::{Comparison, Target};
 use crate::Result;
@@ -8,7 +8,7 @@ use crate::scene::{Camera, LifeKind, Time};
 /// Tables of a layer that a device keeps, in this order: geometry, life, two of the motion's own (see [`Moves`]), SH.
 pub const KEPT: usize = 5;
 
-/// How the rows of a layer move.
+/// Motion of the rows of a layer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Moves {
     /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without
@@ -64,7 +64,7 @@ pub struct ResidentTable<'a> {
 pub struct ResidentLayer<'a> {
     /// Gaussians.
     pub rows: usize,
-    /// How they move.
+    /// Their motion.
     pub moves: Moves,
     /// Their lifespans.
     pub life: LifeKind,

@@ -1,4 +1,4 @@
-//! The roofline of this machine, measured: the numbers that the speed of a stage is a share of.
+//! The roofline of this machine, measured: upper bounds of throughput for the lower bounds of stage times.
 //!
 //! [`blend`] runs the arithmetic of the blend loop alone (exponent from row to row, 2^x, cut-off, α, stop test,
 //! transmittance, three colours), pixels in registers: no list is walked, no row is skipped, no tile changes.

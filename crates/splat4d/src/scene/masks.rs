@@ -1,4 +1,4 @@
-//! Which Gaussians are seen at all, key time by key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2).
+//! Masks of visible Gaussians for each key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2).
 
 use super::{RowEdit, Space};
 

@@ -1,4 +1,4 @@
-//! [`Rows`]: which rows of a table are meant.
+//! [`Rows`]: a selection of rows of a table.
 
 /// Which rows of a table are meant. Output is compact: output row j belongs to row `ids[j]`.
 #[derive(Clone, Copy, Debug)]

@@ -100,7 +100,7 @@ fn strict(path: &Path, console: &Console) -> anyhow::Result<()> {
     Err(Error::input("deviates from the format's specification").at(path.display()).remedy(remedy).into())
 }
 
-/// How a capture is read.
+/// Options of reading a capture.
 fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = Recipe::default();
     if let Some(k) = args.downscale {

@@ -54,7 +54,7 @@ pub(super) fn settle(
     if others.is_empty() {
         return;
     }
-    let one_each = naming.told && naming.cameras.len() == shots.len();
+    let one_each = naming.stated && naming.cameras.len() == shots.len();
     let share = match options.unregistered {
         Unregistered::Share => true,
         Unregistered::Leave => false,
@@ -67,7 +67,7 @@ pub(super) fn settle(
     let shot_of: BTreeMap<usize, usize> = naming.frames.iter().enumerate().map(|(i, f)| (f.0, i)).collect();
     let same_camera = |name: &str| {
         let own = rig::naming(&[name]);
-        let camera = camera_of.get(own.cameras.first().filter(|_| own.told)?.as_str())?;
+        let camera = camera_of.get(own.cameras.first().filter(|_| own.stated)?.as_str())?;
         shot_of.get(camera).copied()
     };
     if one_each && share {

@@ -1,5 +1,5 @@
-//! Images that are copies of one another although their cameras differ: one was overwritten, or a name leads to the wrong
-//! file. Poses and points can be right then, and a few such images hardly show in what is measured over all.
+//! Images that are copies of one another although their cameras differ: one was overwritten, or a name leads to the
+//! wrong file. Poses and points can be right then, and a few such images hardly change measurements over all images.
 
 use super::super::account::{Severity, first_names};
 use super::super::pose::same_pose;

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Lens, Planes};
 
-/// How closely images are examined.
+/// Thoroughness of the examination of images.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Detail {
     /// Longest side of the small image, pixels.

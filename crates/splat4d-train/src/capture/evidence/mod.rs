@@ -349,7 +349,7 @@ pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
 }
 
 impl Measure {
-    /// How well a convention fits, for comparison of those that fit at all.
+    /// Fit of a convention, for comparison with others.
     fn score(&self) -> f64 {
         let points = self.points.seen * (0.1 + self.points.gain.unwrap_or(0.0).max(0.0));
         points + self.pairs.share() + 0.5 * self.foreground.unwrap_or(0.0)

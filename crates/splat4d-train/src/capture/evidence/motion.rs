@@ -25,7 +25,7 @@ const FEWEST: [usize; 2] = [10, 200];
 /// Measured: walks and rooms up to 0.7 %, a moving hand 1.9 % (studies/records/2026-11-26-real-size.md).
 const STATIC: [f64; 2] = [0.003, 0.0125];
 
-/// How far matches of frames at different times agree with one static scene.
+/// Agreement of matches between frames at different times with one static scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Agreement {
     /// Matches that count: those that agree, and those of features that moved.

@@ -103,18 +103,19 @@ pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>,
             })
         })
         .collect();
-    let told = |k: usize| (capture.frames[images[k].frame].image.display().to_string(), signs.get(&at[k]).copied());
+    let described =
+        |k: usize| (capture.frames[images[k].frame].image.display().to_string(), signs.get(&at[k]).copied());
     let wrong = wrong(images.len(), &measured);
     let mut findings = Vec::new();
     let known: Vec<usize> = wrong.iter().map(|&k| images[k].frame).collect();
-    findings.extend(warning(&wrong, &measured, &told));
+    findings.extend(warning(&wrong, &measured, &described));
     let strange = strange.filter(|s| !s.frames.iter().any(|f| known.contains(f)));
     let named: Vec<usize> = strange.iter().flat_map(|s| s.frames.clone()).chain(known).collect();
     findings.extend(strange.map(|s| s.finding(capture)));
     let good = |k: usize| measured.iter().any(|p| p.has(k) && p.share() >= FITS[0]);
     let open: Vec<String> = (0..images.len())
         .filter(|&k| signs.get(&at[k]) == Some(&Sign::Identity) && !good(k) && !wrong.contains(&k))
-        .map(|k| told(k).0)
+        .map(|k| described(k).0)
         .collect();
     let note = |what: String| Finding {
         severity: Severity::Note,
@@ -134,7 +135,7 @@ pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>,
     // Neither points nor matches show that these are right or wrong.
     let silent: Vec<String> = (0..images.len())
         .filter(|&k| doubtful.contains(&at[k]) && !good(k) && !named.contains(&images[k].frame))
-        .map(|k| told(k).0)
+        .map(|k| described(k).0)
         .filter(|name| !open.contains(name))
         .collect();
     if !silent.is_empty() {
@@ -251,7 +252,7 @@ fn wrong(count: usize, pairs: &[Pair]) -> Vec<usize> {
     if wrong.len() as f64 > (FEW * compared as f64).max(1.0) { Vec::new() } else { wrong }
 }
 
-fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Option<Sign>)) -> Option<Finding> {
+fn warning(wrong: &[usize], pairs: &[Pair], described: &dyn Fn(usize) -> (String, Option<Sign>)) -> Option<Finding> {
     if wrong.is_empty() {
         return None;
     }
@@ -260,7 +261,7 @@ fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Opt
         some.fold([0, 0], |[fit, all], p| [fit + p.fitting, all + p.matches])
     };
     let ([fit, all], [others_fit, others]) = (of(true), of(false));
-    let name = |&k: &usize| match told(k) {
+    let name = |&k: &usize| match described(k) {
         (name, Some(sign)) => format!("{name} ({})", sign.in_words()),
         (name, None) => name,
     };

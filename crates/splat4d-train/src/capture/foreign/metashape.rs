@@ -82,7 +82,7 @@ fn pose_of<'a, 'i>(camera: Node<'a, 'i>) -> Option<Node<'a, 'i>> {
     elements(camera, "transform").next()
 }
 
-/// How many cameras of a chunk can be read.
+/// Number of cameras of a chunk that can be read.
 fn readable(chunk: Node<'_, '_>) -> usize {
     cameras(chunk).filter(|c| is_enabled(c) && pose_of(*c).is_some()).count()
 }
@@ -106,14 +106,14 @@ fn chunk<'a, 'i>(document: &'a Document<'i>, warnings: &mut Vec<String>) -> Resu
         };
         return Err(Error::input(what).remedy(remedy));
     }
-    let told = |c: &Node<'_, '_>| {
+    let label = |c: &Node<'_, '_>| {
         format!("{:.80} ({} cameras with poses)", c.attribute("label").unwrap_or("unnamed"), readable(*c))
     };
-    let others: Vec<String> = chunks.iter().filter(|c| **c != chunk && readable(**c) > 0).map(told).collect();
+    let others: Vec<String> = chunks.iter().filter(|c| **c != chunk && readable(**c) > 0).map(label).collect();
     if !others.is_empty() {
         warnings.push(format!(
             "The file has several chunks, each with a world of its own: {} is read, and {} not. To read another, export it alone.",
-            told(&chunk),
+            label(&chunk),
             others.join(", ")
         ));
     }
@@ -244,7 +244,9 @@ fn similarity(node: Node<'_, '_>) -> Result<Sim3> {
     }
     pose::checked(Se3 { rotation: out.rotation, translation: out.translation })?;
     if out.scale.is_nan() || out.scale <= 0.0 {
-        return Err(Error::input(format!("the chunk's scale is {}", out.scale)).remedy("Export the cameras again."));
+        return Err(
+            Error::input(format!("invalid scale {} of the chunk", out.scale)).remedy("Export the cameras again.")
+        );
     }
     Ok(out)
 }

@@ -84,7 +84,7 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCaptu
     // Names are time stamps, and what is scanned is static.
     let sequence = match options.sequence {
         Sequence::Auto => Sequence::Photos,
-        told => told,
+        stated => stated,
     };
     take(root, shots, said, &CaptureOptions { sequence, ..options.clone() })
 }

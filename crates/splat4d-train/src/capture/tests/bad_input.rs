@@ -146,7 +146,7 @@ fn bad_poses_and_focal_lengths() {
 fn duplicate_poses_and_times_are_reported() {
     let sample = samples::own();
     sample.edit("capture.json", |v| v["cameras"][2]["world_to_camera"] = v["cameras"][1]["world_to_camera"].clone());
-    assert_says(&message(&sample), &["cam01 and cam02", "one pose"]);
+    assert_says(&message(&sample), &["cam01 and cam02", "same pose"]);
     let sample = samples::nerfstudio();
     sample.edit("transforms.json", |v| v["frames"][1]["time"] = json!(0.0));
     assert_says(&message(&sample), &["cam0", "two images", "0000.png", "0001.png"]);

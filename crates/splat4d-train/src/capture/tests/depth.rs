@@ -184,7 +184,7 @@ fn invalid_depth_maps_are_refused_by_file_and_frame() {
     sample.edit("capture.json", |v| v["cameras"][1]["depth_scale"] = json!(null));
     assert_says(&message(&sample), &["cam01", "depth_scale"]);
     sample.edit("capture.json", |v| v["cameras"][1]["depth_scale"] = json!(-2));
-    assert_says(&message(&sample), &["cam01", "depth_scale is -2"]);
+    assert_says(&message(&sample), &["cam01", "depth_scale -2"]);
     sample.edit("capture.json", |v| v["cameras"][1]["depth_kind"] = json!("metres"));
     assert_says(&message(&sample), &["cam01", "metres", "inverse"]);
     sample.edit("capture.json", |v| {

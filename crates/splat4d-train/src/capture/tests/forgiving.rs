@@ -242,7 +242,7 @@ fn broken_transforms_are_errors_with_key_and_file() {
     assert_says(&rows, &["transforms.json", "frames[4].transform_matrix", "4x4 matrix"]);
     let missing = broken(&|v| (0..5).for_each(|i| v["frames"][i]["file_path"] = json!(format!("images/gone{i}.png"))));
     assert_says(&missing, &["5 of 9 images are missing", "images/gone0.png", "capture.max_missing=0.56"]);
-    assert_says(&broken(&|v| v["fl_x"] = json!(0)), &["frames[0]", "focal length is 0 x 20", "above zero"]);
+    assert_says(&broken(&|v| v["fl_x"] = json!(0)), &["frames[0]", "focal length 0 x 20", "above zero"]);
     assert_says(&broken(&|v| v["frames"][3]["fl_y"] = json!(-2)), &["frames[3]", "focal length", "-2"]);
     assert_says(
         &broken(&|v| v["frames"][2]["transform_matrix"][0][3] = json!(null)),

@@ -46,15 +46,15 @@ struct Reading {
 
 /// Cameras, frame numbers and seconds where every frame has a time, and the frame rate. `None`: not every frame has
 /// one.
-pub(super) fn told(
+pub(super) fn read_times(
     entries: &[Entry],
     rate: Rate,
     options: &CaptureOptions,
     several: bool,
     account: &mut Account,
 ) -> Option<(FrameOrder, f64)> {
-    let told: Option<Vec<f64>> = entries.iter().map(|e| e.time).collect();
-    let Some(times) = told.filter(|t| !t.is_empty()) else {
+    let stated: Option<Vec<f64>> = entries.iter().map(|e| e.time).collect();
+    let Some(times) = stated.filter(|t| !t.is_empty()) else {
         let without = entries.iter().filter(|e| e.time.is_none()).count();
         if without < entries.len() {
             let what = format!("{without} of {} frames have no time: no time is used.", entries.len());
@@ -151,21 +151,27 @@ fn read(
     }
     let even = whole && step == 1.0 && count > 2;
     if even && rate.stated {
-        return doubt(Times::Frames, format!("they are whole numbers in a row, and {fps} frames a second are stated"));
+        return doubt(
+            Times::Frames,
+            format!("they are whole numbers in a row, and {fps} frames per second are stated"),
+        );
     }
     if even {
         return doubt(Times::Seconds, "they are whole numbers in a row, like frame numbers".into());
     }
     let frames = step * fps;
     if frames.is_finite() && frames >= MANY_FRAMES {
-        return doubt(Times::Seconds, format!("a step of {step:.4} s is {frames:.0} frames at {fps} frames a second"));
+        return doubt(
+            Times::Seconds,
+            format!("a step of {step:.4} s is {frames:.0} frames at {fps} frames per second"),
+        );
     }
     // Cameras of a rig, whose shutters do not open at once, are compared each with itself.
     let own = 2.0 * half_frame(of_camera.iter().copied().zip(times.iter().copied()));
     let per_step = own * fps;
     let between = per_step < FEW_FRAMES && (per_step - per_step.round()).abs() > BETWEEN;
     if rate.stated && own > 0.0 && (per_step < 1.0 - FEWER || between) {
-        return doubt(Times::Seconds, format!("steps of {own:.4} s do not fit {fps} frames a second"));
+        return doubt(Times::Seconds, format!("steps of {own:.4} s do not fit {fps} frames per second"));
     }
     of(Times::Seconds)
 }
@@ -192,7 +198,7 @@ fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account
         .map(|t| ((t * 1e6).round() / 1e6, t))
         .map(|(short, t)| if t.abs() < 1e9 { short } else { t });
     let what = format!(
-        "Times are read as {word}: {} times from {first} to {last} at {} frames a second ({from}): {:.3} s.{doubt}",
+        "Times are read as {word}: {} times from {first} to {last} at {} frames per second ({from}): {:.3} s.{doubt}",
         instants.len(),
         reading.fps,
         span * reading.scale
@@ -213,7 +219,7 @@ fn cameras(entries: &[Entry], times: &[f64]) -> (Vec<String>, Vec<usize>, bool) 
     let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();
     let naming = rig::naming(&names);
     let of: Vec<usize> = naming.frames.iter().map(|f| f.0).collect();
-    if naming.told && naming.cameras.len() > 1 && !crowded(entries, times, &of) {
+    if naming.stated && naming.cameras.len() > 1 && !crowded(entries, times, &of) {
         return (naming.cameras, of, true);
     }
     match by_pose(entries) {

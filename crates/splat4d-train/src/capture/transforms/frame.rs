@@ -153,7 +153,7 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
             let fov = unit * angle.number()?;
             if !(fov > 0.0 && fov < PI) {
                 return Err(angle
-                    .error(format!("the field of view is {fov} rad"))
+                    .error(format!("invalid field of view {fov} rad"))
                     .remedy("It must lie between 0 and π."));
             }
             return Ok(Some((0.5 * side as f64 / (0.5 * fov).tan(), true)));

@@ -90,11 +90,11 @@ pub(crate) fn depth<F: Real>(
         kind => {
             let seen = |p: usize| if kind == DepthKind::Inverse { F::ONE / expected[p] } else { expected[p] };
             let Some((drawn, spread)) = standardised(pixels.iter().map(|&p| seen(p)).collect()) else { return 0.0 };
-            let Some((told, _)) = standardised(pixels.iter().map(|&p| truth.values.data[p]).collect()) else {
+            let Some((known, _)) = standardised(pixels.iter().map(|&p| truth.values.data[p]).collect()) else {
                 return 0.0;
             };
             let (mut sum, mut slopes) = (0.0, Vec::with_capacity(pixels.len()));
-            for (a, b) in drawn.iter().zip(&told) {
+            for (a, b) in drawn.iter().zip(&known) {
                 let (value, slope) = charbonnier(*a - *b);
                 sum += value.f64();
                 slopes.push(slope);
@@ -133,7 +133,7 @@ fn standardised<F: Real>(mut values: Vec<F>) -> Option<(Vec<F>, F)> {
     Some((values, F::of(spread)))
 }
 
-/// How far a rendered image's depth is from a map.
+/// Difference between rendered depth and a depth map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Apart {
     /// Of a metric map: the median of D / D*, and the median of |D / D* − 1|.
@@ -151,9 +151,9 @@ pub(crate) fn apart([depth, alpha]: [&Planes<f32>; 2], truth: DepthTruth<'_>) ->
     if pixels.len() < ENOUGH {
         return None;
     }
-    let told = |p: usize| truth.values.data[p];
+    let known = |p: usize| truth.values.data[p];
     if truth.kind == DepthKind::Metric {
-        let mut ratios: Vec<f32> = pixels.iter().map(|&p| expected[p] / told(p)).collect();
+        let mut ratios: Vec<f32> = pixels.iter().map(|&p| expected[p] / known(p)).collect();
         let median = |values: &mut [f32]| f64::from(median_by(values, f32::total_cmp).expect("there are enough"));
         let ratio = median(&mut ratios);
         ratios.iter_mut().for_each(|r| *r = (*r - 1.0).abs());
@@ -161,8 +161,8 @@ pub(crate) fn apart([depth, alpha]: [&Planes<f32>; 2], truth: DepthTruth<'_>) ->
     }
     let seen = |p: usize| if truth.kind == DepthKind::Inverse { 1.0 / expected[p] } else { expected[p] };
     let (drawn, _) = standardised(pixels.iter().map(|&p| f64::from(seen(p))).collect())?;
-    let (told, _) = standardised(pixels.iter().map(|&p| f64::from(told(p))).collect())?;
-    Some(Apart::Correlation(drawn.iter().zip(&told).map(|(a, b)| a * b).sum::<f64>() / pixels.len() as f64))
+    let (known, _) = standardised(pixels.iter().map(|&p| f64::from(known(p))).collect())?;
+    Some(Apart::Correlation(drawn.iter().zip(&known).map(|(a, b)| a * b).sum::<f64>() / pixels.len() as f64))
 }
 
 #[cfg(test)]

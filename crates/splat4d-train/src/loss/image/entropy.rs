@@ -1,4 +1,4 @@
-//! Entropy of what is half there: opacities and masks that decide for one side.
+//! Entropy of opacities and of the rendered alpha: minimised, they become 0 or 1.
 
 use super::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;

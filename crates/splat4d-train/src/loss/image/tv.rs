@@ -1,4 +1,4 @@
-//! Total variation: images and depths without speckle.
+//! Total variation of images and of depth, against noise.
 
 use super::{ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;

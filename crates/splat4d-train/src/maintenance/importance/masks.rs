@@ -1,5 +1,5 @@
-//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2), united
-//! with the lifespans that no key time meets.
+//! Gaussians to render around each key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2), united with the
+//! lifespans that no key time meets.
 
 use super::temporal::Spatial;
 use super::weighing::Weighing;
@@ -11,7 +11,7 @@ use splat4d::render::Antialias;
 use splat4d::scene::{KeyMasks, Time};
 use std::sync::Arc;
 
-/// How masks are made.
+/// Settings of masks.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct MaskConfig {
     /// Frames of the clip between key times (0 counts as 1); the last gap may be shorter.
@@ -60,7 +60,7 @@ pub(crate) fn key_masks(
 ) -> Result<()> {
     if frames.is_empty() {
         return Err(Error::input("there are no training views to see Gaussians in")
-            .remedy("Hold out fewer views with --set hold_out"));
+            .remedy("Hold out fewer views with --hold-out"));
     }
     let timeline = Timeline::new(frames);
     let times: Vec<f64> = (0..timeline.times()).map(|k| frames.time(timeline.at(k)[0] as usize).0).collect();

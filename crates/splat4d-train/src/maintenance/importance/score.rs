@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training images each is, at times that its lifespan serves well.
+//! Importance scores of Gaussians: contribution to the training images, weighted by the temporal score of the lifespan.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -24,14 +24,14 @@ const THINNEST: f64 = 1e-6;
 /// Frames of a unit of time: a second at the 30 frames a second of 4DGS-1K's captures.
 pub(crate) const UNIT_FRAMES: f64 = 30.0;
 
-/// How Gaussians are scored.
+/// Settings of importance scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ScoreConfig {
     /// The quantity of a view that counts.
     pub spatial: Spatial,
     /// The temporal score of the lifespan.
     pub temporal: Temporal,
-    /// How it meets the spatial score.
+    /// Combination with the spatial score.
     pub combine: Combine,
     /// Whether the temporal score is multiplied with a power of the volume in space and time.
     pub volume: bool,
@@ -89,7 +89,7 @@ pub(crate) fn score(
     );
     if frames.is_empty() {
         return Err(Error::input("there are no training views to score Gaussians by")
-            .remedy("Hold out fewer views with --set hold_out"));
+            .remedy("Hold out fewer views with --hold-out"));
     }
     let timeline = Timeline::new(frames);
     let groups: Vec<Vec<usize>> = (0..timeline.times()).map(|k| views_at(timeline.at(k), k, config.every)).collect();

@@ -1,5 +1,5 @@
-//! How much of the clip a Gaussian's lifespan serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025,
-//! §4.1), and its variants.
+//! Temporal score of a Gaussian's lifespan: the temporal half of the score of 4DGS-1K (Yuan et al. 2025, §4.1), and its
+//! variants.
 //!
 //! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the lifespan, summed over the whole clip, ranks in the opposite
 //! order than its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short lifespan, and a
@@ -17,7 +17,7 @@ use std::str::FromStr;
 /// |p''| of the literal score is cut here: tanh is 1 to 7 digits, and Σ stays finite.
 const LITERAL_LIMIT: f64 = 8.0;
 
-/// How a lifespan becomes a temporal score.
+/// Temporal score of a lifespan.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Temporal {
@@ -61,7 +61,7 @@ pub enum Spatial {
     Speedy,
 }
 
-/// How spatial and temporal score become one.
+/// Combination of spatial and temporal score.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Combine {
@@ -147,7 +147,7 @@ pub(super) struct Lives {
 
 impl Lives {
     pub(super) fn new(layer: &Layer<f32>, clip: f64, unit: f64) -> Self {
-        let (kind, rows) = layer.lives();
+        let (kind, rows) = layer.lifespans();
         Self { kind, rows, span: layer.span, clip, unit }
     }
 

@@ -1,4 +1,4 @@
-//! How much of the views at one time every Gaussian of a scene is.
+//! Contributions of all Gaussians of a scene to the views at one time.
 
 use super::temporal::Spatial;
 use splat4d::layers::{Evaluation, Scene};

@@ -1,4 +1,4 @@
-//! Finished chunks as one scene, and how well they meet.
+//! Joins finished chunks into one scene, and measures the transitions between them.
 
 use super::shared::{LAYER, read_scene};
 use super::train::{of_frames, seconds};

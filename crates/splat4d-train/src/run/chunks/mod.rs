@@ -46,7 +46,7 @@ const WHOLE: usize = 300;
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
-/// Folder in it whose lock states who writes the playback file.
+/// Folder in it with the lock of the playback file's writer.
 const FILM: &str = "film";
 /// Time between two checks whether it may be written.
 const TURNS: Duration = Duration::from_millis(200);
@@ -174,7 +174,7 @@ impl Chunked {
         &self.recipe
     }
 
-    /// How it is cut.
+    /// Its boundaries.
     pub fn plan(&self) -> &ChunkPlan {
         &self.plan
     }

@@ -114,7 +114,7 @@ impl ChunkPlan {
         Ok(self)
     }
 
-    /// How many chunks there are.
+    /// Number of chunks.
     pub fn len(&self) -> usize {
         self.cuts.len() + 1
     }

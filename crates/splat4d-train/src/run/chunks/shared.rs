@@ -1,8 +1,8 @@
 //! Shared parts of chunks: the layer of the static background and the cameras' exposures.
 //!
 //! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene
-//! is trained as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever
-//! changes: chunks learn what it omits, but cannot correct errors in it.
+//! is trained as any other run is. Only Gaussians that most cameras see in static regions are kept: chunks can add what
+//! is missing in the layer, but cannot correct errors in it.
 
 use super::Chunked;
 use crate::Result;

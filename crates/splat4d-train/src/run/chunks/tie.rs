@@ -1,4 +1,4 @@
-//! The tie of a chunk to a finished neighbour: where they overlap, their images are to be alike.
+//! The tie of a chunk to a finished neighbour: a loss on the difference of their renders in the overlap.
 
 use super::shared::read_file;
 use crate::Result;

@@ -51,7 +51,7 @@ fn write(place: &Place, made: &Made) {
 fn known_flow_teaches_motion() {
     let (place, made) = (Place::new(), Made::new(4, 3, 24));
     let refused = place.train("none", &recipe(&["lambda_flow=1"])).unwrap_err().to_string();
-    assert!(refused.contains("lambda_flow") && refused.contains("capture.json"), "{refused}");
+    assert!(refused.contains("loss.flow") && refused.contains("capture.json"), "{refused}");
     write(&place, &made);
     let error = |lambda: f64| {
         let r = recipe(&["strategy=none", "num_pts=200", "half_size_until=0.3", "velocity_lr_init=0.03"])
@@ -150,7 +150,7 @@ fn flow_that_runs_backwards_is_refused_by_file_and_frame() {
     };
     write([-3.0, 0.0]);
     let text = place.train("back", &all).unwrap_err().to_string();
-    assert!(["backwards", "0000.png", "frame 0", "camera"].iter().all(|word| text.contains(word)), "{text}");
+    assert!(["reversed", "0000.png", "frame 0", "camera"].iter().all(|word| text.contains(word)), "{text}");
     write([0.0, 3.0]);
     let text = place.train("turned", &all).unwrap_err().to_string();
     assert!(["u and v", "0000.png", "frame 0"].iter().all(|word| text.contains(word)), "{text}");

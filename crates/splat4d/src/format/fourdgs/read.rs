@@ -99,7 +99,7 @@ fn row_of(file: &File, chunk: &Chunk, row: usize) -> Result<(Row, [f64; 2])> {
     let window = usize::try_from(index).ok().and_then(|i| file.windows.get(i));
     let window = *window.ok_or_else(|| damaged(format!("window {index} of {}", file.windows.len())))?;
     if window.iter().any(|t| t.is_nan()) {
-        return Err(damaged(format!("window {index} is no span of time")));
+        return Err(damaged(format!("window {index} has a time that is not a number")));
     }
     let sigma = (bin(chunk, FLAGS, row, 0) & ALWAYS == 0).then(|| number(SIGMA, 0, s.log_sigma).exp());
     let velocity_step = motion_step(s.motion, half_life(header.cutoff, sigma, window[1] - window[0]));

@@ -170,7 +170,7 @@ fn steps_of(c: &mut Cursor<'_>) -> Result<Steps> {
         *x = f64_of(c)?;
     }
     if !numbers.iter().all(|x| x.is_finite()) || numbers[3..].iter().any(|x| *x <= 0.0) {
-        return Err(damaged("a step of its bins is no positive number"));
+        return Err(damaged("a step of its bins is not a positive number"));
     }
     let [x, y, z, position, log_scale, rotation, color, opacity, motion, time, log_sigma] = numbers;
     Ok(Steps { origin: [x, y, z], position, log_scale, rotation, color, opacity, motion, time, log_sigma })
@@ -183,7 +183,7 @@ fn windows_of(c: &mut Cursor<'_>) -> Result<Vec<[f64; 2]>> {
     (0..count).map(|_| Ok([f64_of(&mut inner)?, f64_of(&mut inner)?])).collect()
 }
 
-/// `most`: Gaussians that are believed.
+/// `most`: Gaussians that are accepted.
 fn chunk_of(c: &mut Cursor<'_>, most: usize) -> Result<Chunk> {
     let _span = [f64_of(c)?, f64_of(c)?];
     let (_level, rows) = (c.u32()?, c.u32()? as usize);

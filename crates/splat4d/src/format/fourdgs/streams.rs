@@ -8,7 +8,7 @@ use flate2::Compression;
 use flate2::write::ZlibEncoder;
 use std::io::Write;
 
-/// How the bins of an attribute follow from the symbols.
+/// Decoding of an attribute's symbols into bins.
 const RAW: u8 = 0;
 const DELTA: u8 = 1;
 const CONSTANT: u8 = 2;

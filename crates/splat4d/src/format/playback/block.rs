@@ -23,7 +23,7 @@ type Column = [f64; BLOCK_GAUSSIANS];
 
 /// Up to 256 Gaussians on their way into a block.
 pub(super) struct Columns {
-    /// How many there are.
+    /// Number of them.
     pub rows: usize,
     /// At `center`, scene units.
     pub mean: [Column; 3],

@@ -72,7 +72,7 @@ impl Kind {
     }
 }
 
-/// How a section is stored.
+/// Encoding of a section.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Codec {
     /// As it is.
@@ -108,7 +108,7 @@ pub struct Entry {
     pub bytes: u32,
     /// CRC-32 of the stored bytes.
     pub crc: u32,
-    /// How it is stored.
+    /// Encoding.
     pub codec: Codec,
     /// Page: the tier, 0 the most important.
     pub tier: u16,
@@ -271,7 +271,7 @@ impl Index {
             for (page, i) in beside {
                 let count = self.sections[i].count;
                 if self.sections.get(page as usize).is_none_or(|e| e.kind != Kind::Page || e.count != count) {
-                    let what = format!("its page, section {page}, is none of {count} Gaussians");
+                    let what = format!("its page, section {page}, is not a page of {count} Gaussians");
                     return Err(broken(what).at(format!("section {i}")));
                 }
             }
@@ -281,7 +281,7 @@ impl Index {
             gaussians += u64::from(page.count);
             let Some(p) = page.palette else { continue };
             if self.sections.get(p as usize).is_none_or(|e| e.kind != Kind::Palette) {
-                return Err(broken(format!("its palette, section {p}, is none")).at(format!("section {i}")));
+                return Err(broken(format!("its palette, section {p}, is not a palette")).at(format!("section {i}")));
             }
         }
         if gaussians != self.meta.gaussians as u64 {

@@ -31,7 +31,7 @@ const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
 const WEIGHTS: [f32; 2] = [0.01, 100.0];
 
-/// How to write.
+/// Options of the writer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WriteConfig {
     /// Most entries of the palette, at most 65,536. There are never more than one for 12 Gaussians (or 256 in all).

@@ -5,7 +5,7 @@
 use crate::{Error, ErrorKind, Result};
 use std::borrow::Cow;
 
-/// Longest header that is believed. The header of a degree-3 Gaussian file has 1.5 kB.
+/// Longest header that is accepted. The header of a degree-3 Gaussian file has 1.5 kB.
 const MAX_HEADER: usize = 1 << 20;
 /// UTF-8's byte-order mark, with which editors begin text files.
 const BOM: &[u8] = b"\xef\xbb\xbf";
@@ -17,7 +17,7 @@ pub(super) fn is_ply(bytes: &[u8]) -> bool {
     bytes.strip_prefix(BOM).unwrap_or(bytes).starts_with(b"ply")
 }
 
-/// How the body is written.
+/// Encoding of the body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
     Ascii,

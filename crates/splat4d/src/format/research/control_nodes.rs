@@ -124,7 +124,7 @@ impl Nodes {
     }
 }
 
-/// What the Gaussians have for their nodes.
+/// Per-Gaussian inputs of skinning.
 struct Features {
     /// [rows, hyper]
     hyper: Vec<f32>,

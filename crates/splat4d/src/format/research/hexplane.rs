@@ -107,7 +107,7 @@ fn shape_of(job: &Job<'_>) -> Result<PlaneShape> {
     while let Some([_, _, side]) = axes(multires.len(), 0) {
         if resolution == 0 || side % resolution != 0 {
             return Err(bad(format!(
-                "the planes of level {} have {side} points, no multiple of {resolution}",
+                "the planes of level {} have {side} points, which is not a multiple of {resolution}",
                 multires.len()
             )));
         }

@@ -46,7 +46,7 @@ struct Trained<'a> {
     settings: &'a str,
 }
 
-/// What a reader gets.
+/// Input of a reader.
 struct Job<'a> {
     files: Trained<'a>,
     state: State<'a>,

@@ -44,9 +44,9 @@ pub const DIALECT: Dialect = Dialect {
 pub(crate) const VERSION: u64 = 2;
 /// The file that describes the others.
 pub const META: &str = "meta.json";
-/// Most Gaussians that are believed, a byte of the files: real ones take eight bytes and more each.
+/// Most Gaussians that are accepted, a byte of the files: real ones take eight bytes and more each.
 const PER_BYTE: usize = 1;
-/// Gaussians that are believed in any case, so that tiny files of equal Gaussians can be read.
+/// Gaussians that are accepted in any case, so that tiny files of equal Gaussians can be read.
 const ALWAYS: usize = 4096;
 /// Longest `meta.json` that is read, bytes: its four codebooks take some 20 kB.
 const MOST_META: usize = 4 << 20;

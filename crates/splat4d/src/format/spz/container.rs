@@ -20,14 +20,14 @@ const OLD_HEADER: usize = 16;
 const NEW_HEADER: usize = 32;
 /// Bytes of an entry of the table of contents: u64 compressed, u64 plain length.
 const ENTRY: usize = 16;
-/// Most Gaussians that are believed, a byte of the file: real ones take eight bytes and more each. (Deflate and zstd
+/// Most Gaussians that are accepted, a byte of the file: real ones take eight bytes and more each. (Deflate and zstd
 /// would allow a thousand times that.)
 const PER_BYTE: usize = 1;
-/// Gaussians that are believed in any case, so that small files of equal Gaussians can be read.
+/// Gaussians that are accepted in any case, so that small files of equal Gaussians can be read.
 const ALWAYS: usize = 1 << 16;
 /// Bytes of extensions behind the streams that are inflated to get to the checksum.
 const MOST_TAIL: u64 = 1 << 20;
-/// What a file holds.
+/// Content of a file.
 pub(super) struct Opened<'a> {
     pub(super) header: Header,
     pub(super) streams: Streams<'a>,

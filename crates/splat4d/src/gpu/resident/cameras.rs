@@ -28,7 +28,7 @@ impl Cameras {
         Self { count: 0, buffer: Grown::storage("the cameras' colours") }
     }
 
-    /// How many.
+    /// Count.
     pub(super) fn count(&self) -> usize {
         self.count
     }
@@ -38,7 +38,7 @@ impl Cameras {
         &self.buffer
     }
 
-    /// How many these are.
+    /// Count of these.
     pub(super) fn numbers(&self) -> usize {
         self.count * (PARTS * RESPONSES + 2)
     }

@@ -1,5 +1,5 @@
-//! Frames one after the other of a scene that stays on the GPU, none of them read back: how fast a screen could show
-//! them.
+//! Renders successive frames of a scene that stays on the GPU without reading them back: the rate at which a screen
+//! could show them.
 
 use super::{Tables, at};
 use crate::Result;

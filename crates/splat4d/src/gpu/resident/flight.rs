@@ -1,5 +1,5 @@
-//! Steps in flight: begun without a wait, and done some steps later, when the GPU has written their record
-//! (record.wgsl).
+//! Steps in flight: submitted without waiting, and completed some steps later, when the GPU has written their status
+//! record (record.wgsl).
 //!
 //! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that step nor of later ones,
 //! which may already be in flight. The reader of the record enlarges the buffers, or cuts images into more bands, and

@@ -165,7 +165,7 @@ pub(crate) struct Written<'a, F> {
     pub heads: &'a [F],
     /// Heads a row.
     pub width: usize,
-    /// How positions move.
+    /// Motion of positions.
     pub bounds: Bounds<F>,
 }
 
@@ -193,7 +193,7 @@ pub(crate) struct Gradient<'a, F> {
     pub heads: Option<&'a [F]>,
     /// Heads a row.
     pub width: usize,
-    /// How positions move.
+    /// Motion of positions.
     pub bounds: Bounds<F>,
     /// [rows, 10]
     pub d_out: &'a Table<F>,

@@ -106,7 +106,7 @@ impl Keys {
 /// R (rows), p + T − R p, unit quaternion.
 type Rigid<F> = ([[F; 3]; 3], [F; 3], [F; 4]);
 
-/// The nodes' rigid motions at one time, and who follows them.
+/// The nodes' rigid motions at one time, and the Gaussians that follow them.
 pub(super) struct Pulls<'a, F> {
     nodes: Vec<Rigid<F>>,
     /// By Gaussian.

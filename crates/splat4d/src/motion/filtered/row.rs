@@ -53,7 +53,7 @@ impl Normal {
     }
 }
 
-/// How a Gaussian is taken to continue. Means continue at constant velocity in all of them.
+/// Prediction of a Gaussian's shape. Means continue at constant velocity in all of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Predictor {
@@ -134,7 +134,7 @@ impl Prediction {
     }
 }
 
-/// How prediction and observation become one state.
+/// Fusion of prediction and observation into one state.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Fusion {
@@ -162,7 +162,7 @@ const EPSILON: f64 = 1e-12;
 pub(crate) struct Fused {
     /// The state.
     pub point: Normal,
-    /// How far the prediction counts at all: `trust` times what the gate leaves.
+    /// Weight of the prediction: `trust` times the gate.
     pub open: f64,
     gain: f64,
     trust: f64,
@@ -286,7 +286,7 @@ impl Fused {
     }
 }
 
-/// How open the gate is for a squared innovation, and the slope.
+/// Value of the gate for a squared innovation, and its slope.
 fn gate_of(innovation: f64, gate: f64) -> [f64; 2] {
     if gate <= 0.0 {
         return [1.0, 0.0];

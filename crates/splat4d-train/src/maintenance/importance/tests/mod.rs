@@ -286,6 +286,6 @@ fn masks_contain_gaussians_visible_at_keys_and_between_keys() {
 fn scoring_without_views_is_an_error() {
     let none = Made::new(3, 0, 8);
     let error = score(&scene(4), &none, &ScoreConfig::default(), &mut |_, _| {}).unwrap_err().to_string();
-    assert!(error.contains("no training views") && error.contains("hold_out"), "{error}");
+    assert!(error.contains("no training views") && error.contains("--hold-out"), "{error}");
     assert!(key_masks(&mut scene(4), &none, &MaskConfig::default(), &mut |_, _| {}).is_err());
 }
