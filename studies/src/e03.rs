@@ -213,7 +213,13 @@ impl Trial {
     fn make(&self, cell: &Cell, folder: &Path, stop: &AtomicBool, console: &Console) -> anyhow::Result<Scene<f32>> {
         files::make_folder(folder)?;
         let settings = cell.settings();
-        let job = Job { source: &self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings: &settings };
+        let job = Job {
+            source: &self.scene,
+            capture: self.capture.clone(),
+            recipe: &self.recipe,
+            settings: &settings,
+            exposures: &[],
+        };
         // The cell has been announced: that a run begins and ends is no news.
         let mut listen = |event: &Event| {
             if !matches!(event, Event::Started { .. } | Event::Finished { .. }) {

@@ -63,14 +63,15 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
     if s.prune == 0.0 && s.fine_tune == 0 && !filter {
         return Ok(Vec::new());
     }
-    (0..s.rounds)
+    let rounds = s.pruning_rounds();
+    (0..rounds)
         .map(|round| {
-            let steps = s.fine_tune * (round + 1) / s.rounds - s.fine_tune * round / s.rounds;
+            let steps = s.fine_tune * (round + 1) / rounds - s.fine_tune * round / rounds;
             let mut stage = host_stage(prepared, steps)?;
-            stage.name = format!("pruned {}/{}", round + 1, s.rounds);
+            stage.name = format!("pruned {}/{rounds}", round + 1);
             // Equal shares of what is left, so that the last round reaches the requested number.
-            let share = 1.0 - (1.0 - s.prune).powf(1.0 / s.rounds as f64);
-            let last = round + 1 == s.rounds;
+            let share = 1.0 - (1.0 - s.prune).powf(1.0 / rounds as f64);
+            let last = round + 1 == rounds;
             stage.start = Some(pruning(prepared.clone(), share, filter && last));
             Ok(stage)
         })
