@@ -210,8 +210,14 @@ fn strange(
 /// Whether matches with the images around it show that an image has the right pose: points may be hidden from it.
 fn matched(capture: &Capture, order: &[usize], frame: usize) -> bool {
     let Some(k) = order.iter().position(|&f| f == frame) else { return false };
-    let around = &order[k.saturating_sub(BESIDE)..(k + BESIDE + 1).min(order.len())];
-    let mut images = look::take(capture, around, look::COARSE);
+    let mut around = order[k.saturating_sub(BESIDE)..(k + BESIDE + 1).min(order.len())].to_vec();
+    // Photos of an object are in no order.
+    let place = |&f: &usize| capture.frames[f].source.center();
+    let mut nearest: Vec<usize> = order.iter().copied().filter(|f| !around.contains(f)).collect();
+    let far = |f: &usize| norm(sub(place(f), place(&frame)));
+    nearest.sort_by(|a, b| far(a).total_cmp(&far(b)).then(a.cmp(b)));
+    around.extend(nearest.into_iter().take(2 * BESIDE));
+    let mut images = look::take(capture, &around, look::COARSE);
     look::describe(&mut images, look::COARSE);
     let Some(own) = images.iter().position(|l| l.frame == frame) else { return false };
     let poses: Vec<Se3> = images.iter().map(|l| capture.frames[l.frame].source.cam_from_world).collect();
