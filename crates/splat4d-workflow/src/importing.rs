@@ -20,6 +20,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const CAPTURE: &str = "capture.json";
 /// Files that an import writes into its folder, in addition to its corrections.
 const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
+/// Files by which a run is recognised.
+const RUN: [&str; 2] = ["recipe.toml", "run.json"];
 /// Findings of the doctor that the text contains; its page has all.
 const MOST: usize = 6;
 
@@ -155,6 +157,11 @@ impl Imported {
 /// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never
 /// replaced.
 fn check_ours(folder: &Path) -> Result<()> {
+    if let Some(name) = RUN.iter().find(|name| folder.join(name).is_file()) {
+        return Err(Error::input(format!("the folder contains a run ({name})"))
+            .at(folder.display())
+            .remedy("Give another folder with option `output`."));
+    }
     if folder.join(corrections::FILE).is_file() {
         return Ok(());
     }

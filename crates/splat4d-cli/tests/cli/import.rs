@@ -409,6 +409,11 @@ fn unsupported_inputs_are_refused_with_a_reason() {
     assert!(refused(&films, &["--apart", "cam06,cam99=2"]).contains("cam99"));
     let twice = splat4d(&["import", str(&one), str(&one), "-o", str(&take)]).run().refused();
     assert!(twice.contains("the same as"), "{twice}");
+    // A run stays a run.
+    std::fs::create_dir(at("run")).unwrap();
+    std::fs::write(at("run/recipe.toml"), "").unwrap();
+    let run = splat4d(&["import", str(&one), "-o", str(&at("run"))]).run().refused();
+    assert!(run.contains("contains a run (recipe.toml)"), "{run}");
     // Two cameras that see nothing in common.
     let far = at("far");
     for name in ["cam00", "cam19"] {
