@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 #[derive(Clone, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Sampler {
-    /// Every frame once an epoch, in random order.
+    /// Every frame once an epoch, in random order; those at the ends of a clip more often.
     #[default]
     Uniform,
     /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
@@ -40,11 +40,19 @@ pub(crate) struct Draw {
 /// Share of a window sampler's frames that come from its window; the rest replays the capture.
 const WINDOW_SHARE: f64 = 0.8;
 
+/// Fewest distinct times of a clip whose ends are shown more often.
+const CLIP: usize = 8;
+/// How often an epoch shows the frames at the outermost times, and at those next to them, in addition: they have neighbours on one side only. With
+/// several cameras, and with one image per time. Two more copies with several cameras lose 0.4 dB in the middle (studies/records/2026-11-27-ends.md).
+const ENDS: [[usize; 2]; 2] = [[1, 0], [2, 1]];
+
 /// Frame numbers sorted by distinct time.
 #[derive(Clone, Debug)]
 pub(crate) struct Timeline {
     frames: Vec<Vec<u32>>,
     count: usize,
+    /// What an epoch shows in addition, by [`ENDS`].
+    ends: Vec<u32>,
     /// The permutation used last: seed, address, length and the order itself. Without it every step would shuffle all
     /// frames of the capture to learn of one.
     order: Arc<Mutex<(u64, u64, Vec<u32>)>>,
@@ -64,7 +72,14 @@ impl Timeline {
             }
             groups.last_mut().expect("a group was just pushed").push(i as u32);
         }
-        Self { frames: groups, count: frames.len(), order: Arc::default() }
+        let mut ends = Vec::new();
+        if groups.len() >= CLIP {
+            let copies = ENDS[usize::from(groups.len() == frames.len())];
+            for (k, &copies) in copies.iter().enumerate() {
+                (0..copies).for_each(|_| ends.extend(groups[k].iter().chain(&groups[groups.len() - 1 - k])));
+            }
+        }
+        Self { frames: groups, count: frames.len(), ends, order: Arc::default() }
     }
 
     /// Number of distinct times.
@@ -95,7 +110,9 @@ impl Timeline {
         let (times, n) = (self.frames.len(), self.count);
         let flat = |i: usize| {
             // The i-th sample without replacement: which epoch, and where in its permutation.
-            self.shuffled(seed, (stage * 1_000_003 + i / n) as u64, n, i % n)
+            let all = n + self.ends.len();
+            let frame = self.shuffled(seed, (stage * 1_000_003 + i / all) as u64, all, i % all);
+            frame.checked_sub(n).map_or(frame, |end| self.ends[end] as usize)
         };
         let any_of = |group: &[u32], draw: u64| group[step_rng.below(draw, group.len())] as usize;
         match *sampler {
@@ -139,6 +156,24 @@ impl Timeline {
 mod tests {
     use super::*;
     use crate::step::tests::Made;
+
+    #[test]
+    fn ends_of_a_clip_are_sampled_more_often() {
+        let counts = |cameras: usize, times: usize| {
+            let line = Timeline::new(&Made::new(cameras, times, 4));
+            let steps = cameras * times + line.ends.len();
+            let mut counts = vec![0; times];
+            for step in 0..steps {
+                let draw = Draw { seed: 7, stage: 0, taken: step, place: step, steps };
+                let [frame] = line.draw(&Sampler::Uniform, 1, draw)[..] else { panic!("one view per step") };
+                counts[line.frames.iter().position(|f| f.contains(&(frame as u32))).unwrap()] += 1;
+            }
+            counts
+        };
+        assert_eq!(counts(2, 9), [4, 2, 2, 2, 2, 2, 2, 2, 4]);
+        assert_eq!(counts(1, 9), [3, 2, 1, 1, 1, 1, 1, 2, 3]);
+        assert_eq!(counts(2, 5), [2; 5], "too short to have a middle");
+    }
 
     #[test]
     fn every_frame_is_sampled_once_an_epoch_by_a_pure_function() {

@@ -603,7 +603,7 @@ fn photos_are_measured_with_the_exposure_that_was_learnt() {
     let exposure = trainer.train_state.exposure.as_mut().unwrap();
     let key = exposure.key();
     for &camera in exposure.trained().to_vec().iter() {
-        exposure.params[key].write(camera, 0, std::array::from_fn(|k| if k == 9 { 0.1 } else { 0.0 }));
+        exposure.params[key].write(camera, 0, std::array::from_fn::<f32, 12, _>(|k| if k == 9 { 0.1 } else { 0.0 }));
     }
     let folder = place.run("photos");
     std::fs::create_dir_all(&folder).unwrap();
