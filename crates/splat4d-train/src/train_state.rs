@@ -10,8 +10,7 @@ mod exposure;
 pub(crate) use corrections::Scale;
 pub use corrections::{Corrections, RefineSettings};
 pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
-pub use exposure::COLUMNS as EXPOSURE_COLUMNS;
-pub(crate) use exposure::{Exposure, expose};
+pub(crate) use exposure::{COLUMNS as EXPOSURE_COLUMNS, Exposure, expose};
 
 use crate::Result;
 use crate::optim::Moments;

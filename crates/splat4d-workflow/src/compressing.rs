@@ -24,7 +24,6 @@ use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{TrainOptions, checkpoint, corrected};
-use splat4d_train::train_state::EXPOSURE_COLUMNS;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -566,7 +565,7 @@ struct Original<'a> {
     capture: Arc<Capture>,
     recipe: Recipe,
     /// What its cameras do to colours, frame by frame.
-    exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
+    exposures: Vec<[f32; 12]>,
 }
 
 impl Original<'_> {

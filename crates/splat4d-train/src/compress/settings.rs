@@ -136,7 +136,7 @@ impl Compression {
         low * f64::powf(high / low, t)
     }
 
-    /// The number of rounds. What the first one removes changes what the others are worth to the images.
+    /// The number of rounds. Scores of Gaussians change once others are removed.
     pub(crate) fn pruning_rounds(&self) -> usize {
         match self.rounds {
             0 if self.prune > ONE_ROUND => ROUNDS,

@@ -9,7 +9,7 @@ use splat4d::simd::{Kernel, Simd, dispatch, each};
 use std::collections::BTreeSet;
 
 /// Columns of a camera: its matrix without the identity, row by row, then an offset a channel.
-pub const COLUMNS: usize = 12;
+pub(crate) const COLUMNS: usize = 12;
 /// The first offset.
 const OFFSET: usize = 9;
 /// Pixels of a piece of parallel work: sums are per piece and in order, so that they do not depend on the threads.
@@ -26,9 +26,9 @@ const RUN: usize = 32;
 #[derive(Debug)]
 pub struct Exposure {
     /// One table [cameras, 12].
-    pub params: Params<f32>,
+    pub(crate) params: Params<f32>,
     /// Its moments.
-    pub moments: Moments<f32>,
+    pub(crate) moments: Moments<f32>,
     key: Key,
     pub(crate) grads: Grads<f32>,
     trained: Vec<usize>,
