@@ -41,7 +41,7 @@ pub(crate) struct Draw {
 const WINDOW_SHARE: f64 = 0.8;
 
 /// Fewest distinct times of a clip whose ends are shown more often.
-const CLIP: usize = 8;
+const CLIP: usize = 12;
 /// How often an epoch shows the frames at the outermost times, and at those next to them, in addition: they have neighbours on one side only. With
 /// several cameras, and with one image per time. Two more copies with several cameras lose 0.4 dB in the middle (studies/records/2026-11-27-ends.md).
 const ENDS: [[usize; 2]; 2] = [[1, 0], [2, 1]];
@@ -170,8 +170,8 @@ mod tests {
             }
             counts
         };
-        assert_eq!(counts(2, 9), [4, 2, 2, 2, 2, 2, 2, 2, 4]);
-        assert_eq!(counts(1, 9), [3, 2, 1, 1, 1, 1, 1, 2, 3]);
+        assert_eq!(counts(2, 12), [4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 4]);
+        assert_eq!(counts(1, 12), [3, 2, 1, 1, 1, 1, 1, 1, 1, 1, 2, 3]);
         assert_eq!(counts(2, 5), [2; 5], "too short to have a middle");
     }
 

@@ -124,6 +124,7 @@ fn prepared(job: &Job<'_>) -> Result<Prepared> {
         recipe: job.recipe.clone(),
         cameras: cameras(&job.capture),
         settings: job.settings.clone(),
+        count: job.source.len(),
     })
 }
 

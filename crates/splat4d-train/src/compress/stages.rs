@@ -33,6 +33,8 @@ pub(super) struct Prepared {
     pub recipe: Recipe,
     pub cameras: Vec<Camera>,
     pub settings: Compression,
+    /// Gaussians of the scene that is compressed.
+    pub count: usize,
 }
 
 impl Prepared {
@@ -69,10 +71,12 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
             let steps = s.fine_tune * (round + 1) / rounds - s.fine_tune * round / rounds;
             let mut stage = host_stage(prepared, steps)?;
             stage.name = format!("pruned {}/{rounds}", round + 1);
-            // Equal shares of what is left, so that the last round reaches the requested number.
-            let share = 1.0 - (1.0 - s.prune).powf(1.0 / rounds as f64);
+            // Equal shares of what is left; the last round leaves the requested number.
             let last = round + 1 == rounds;
-            stage.start = Some(pruning(prepared.clone(), share, filter && last));
+            let left = (1.0 - s.prune).powf((round + 1) as f64 / rounds as f64);
+            let removed = if last { s.prune } else { 1.0 - left };
+            let keep = prepared.count - (removed * prepared.count as f64).round() as usize;
+            stage.start = Some(pruning(prepared.clone(), keep.max(1), filter && last));
             Ok(stage)
         })
         .collect()
@@ -99,10 +103,11 @@ fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
 }
 
-/// Scores, prunes, and makes masks where they are needed already.
-fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
+/// Scores, prunes to `keep` Gaussians, and makes masks where they are needed already.
+fn pruning(prepared: Prepared, keep: usize, filter: bool) -> Hook {
     Box::new(move |scene: &mut Scene<f32>, progress| {
-        if share > 0.0 {
+        if keep < scene.len() {
+            let share = 1.0 - keep as f64 / scene.len() as f64;
             let scores = score(scene, prepared.frames.as_ref(), &prepared.score_config()?, &mut |done, total| {
                 progress.phase("scoring Gaussians", done, total);
             })?;
