@@ -25,7 +25,8 @@ fn a_run_is_compressed_and_measured_before_and_after() {
     assert!(gaussians("after") <= gaussians("before").div_ceil(2), "half is gone");
     assert_eq!(told["settings"]["prune"], 0.5);
     let stages: Vec<&str> = told["stages"].as_array().unwrap().iter().map(|s| s["name"].as_str().unwrap()).collect();
-    assert_eq!(stages, ["pruned 1/4", "pruned 2/4", "pruned 3/4", "pruned 4/4", "quantised"]);
+    // Of eight steps none is left for the first round.
+    assert_eq!(stages, ["pruned 2/4", "pruned 3/4", "pruned 4/4", "quantised"]);
     let spent: u64 = told["stages"].as_array().unwrap().iter().map(|s| s["steps"].as_u64().unwrap()).sum();
     assert_eq!(spent, 8, "as many steps as were asked for");
 

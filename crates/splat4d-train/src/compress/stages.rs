@@ -34,7 +34,7 @@ pub(super) struct Prepared {
     pub cameras: Vec<Camera>,
     pub settings: Compression,
     /// Gaussians of the scene that is compressed.
-    pub count: usize,
+    pub(super) count: usize,
 }
 
 impl Prepared {
