@@ -218,7 +218,7 @@ impl Trial {
             capture: self.capture.clone(),
             recipe: &self.recipe,
             settings: &settings,
-            exposures: &[],
+            run: None,
         };
         // The cell has been announced: that a run begins and ends is no news.
         let mut listen = |event: &Event| {

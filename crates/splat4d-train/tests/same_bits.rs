@@ -193,7 +193,7 @@ fn lines_of(name: &str, changes: &str, capture: &Path, folder: &Path) -> BTreeMa
     }
     if COMPRESSED.contains(&name) {
         let settings = Compression::level(Level::Pruned, 30);
-        let job = Job { source: &source, capture, recipe: &recipe, settings: &settings, exposures: &[] };
+        let job = Job { source: &source, capture, recipe: &recipe, settings: &settings, run: None };
         let small = folder.join(format!("{name}-small"));
         compress(&job, &small, &options, &go, &mut |_| {}).unwrap();
         add_tensors(&newest_checkpoint(&small), "compressed/", &mut lines);

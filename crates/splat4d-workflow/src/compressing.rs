@@ -23,7 +23,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{TrainOptions, checkpoint, corrected};
+use splat4d_train::run::{TrainOptions, checkpoint};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -327,8 +327,7 @@ impl Work {
         })?;
         console.phase("reading the capture", 0, 0);
         let (capture, recipe) = run.open_capture()?;
-        let exposures = corrected::exposures(&capture, &run.path)?;
-        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), exposures };
+        let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), run: &run.path };
         let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
@@ -564,19 +563,13 @@ struct Original<'a> {
     scene: &'a Scene<f32>,
     capture: Arc<Capture>,
     recipe: Recipe,
-    /// What its cameras do to colours, frame by frame.
-    exposures: Vec<[f32; 12]>,
+    /// The run that learnt it.
+    run: &'a Path,
 }
 
 impl Original<'_> {
     fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
-        Job {
-            source: self.scene,
-            capture: self.capture.clone(),
-            recipe: &self.recipe,
-            settings,
-            exposures: &self.exposures,
-        }
+        Job { source: self.scene, capture: self.capture.clone(), recipe: &self.recipe, settings, run: Some(self.run) }
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
@@ -585,7 +578,7 @@ impl Original<'_> {
         let options = EvalOptions {
             antialias: self.recipe.appearance.antialias,
             pictures: false,
-            exposures: self.exposures.clone(),
+            exposures_of: Some(self.run.to_owned()),
             ..EvalOptions::default()
         };
         let scores = assess(scene, &self.capture, &store, 0, &options, stop, &mut |event| console.event(event))?;

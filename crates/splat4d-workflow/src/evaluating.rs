@@ -419,7 +419,7 @@ impl Measuring<'_> {
             measured,
             place,
             align: Align::of(capture, self.recipe),
-            exposures: corrected::exposures(capture, &self.opened.path)?,
+            exposures_of: Some(self.opened.path.clone()),
             device: self.measure.device,
             ..EvalOptions::default()
         };

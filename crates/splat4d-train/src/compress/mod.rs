@@ -25,10 +25,10 @@ use crate::event::Event;
 use crate::maintenance::Strategy;
 use crate::maintenance::importance::{Scores, score};
 use crate::recipe::Recipe;
-use crate::run::{Outcome, TrainOptions};
+use crate::run::{Outcome, TrainOptions, corrected};
 use crate::run::{Refine, refine};
 use crate::run::{plan, training_frames};
-use crate::train_state::{EXPOSURE_COLUMNS, Exposure};
+use crate::train_state::Exposure;
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages, feature_ranges};
@@ -54,8 +54,8 @@ pub struct Job<'a> {
     pub recipe: &'a Recipe,
     /// The settings of compression.
     pub settings: &'a Compression,
-    /// What the cameras of the capture's frames do to colours, as the scene's run learnt it ([`crate::run::corrected::exposures`]); empty: nothing.
-    pub exposures: &'a [[f32; EXPOSURE_COLUMNS]],
+    /// The run that learnt the scene, whose exposures of photos are learnt on; `None`: they begin from the identity.
+    pub run: Option<&'a Path>,
 }
 
 /// The result of a compression.
@@ -88,6 +88,8 @@ pub fn compress(
     if stages.is_empty() {
         return Err(Error::input("no operation is selected").remedy("Prune, filter or quantise."));
     }
+    let exposures = job.run.map(|run| corrected::exposures(&job.capture, run)).transpose()?.unwrap_or_default();
+    let exposure = (!exposures.is_empty()).then(|| Exposure::learnt(&job.capture, &exposures));
     let refined = refine(
         Refine {
             made_by: VERB.into(),
@@ -95,7 +97,7 @@ pub fn compress(
             stages,
             frames: training_frames(job.capture.clone(), job.recipe)?,
             recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
-            exposure: (!job.exposures.is_empty()).then(|| Exposure::learnt(&job.capture, job.exposures)),
+            exposure,
             identity: job.settings.to_toml(),
             budget: None,
         },

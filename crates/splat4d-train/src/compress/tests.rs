@@ -22,13 +22,7 @@ impl Bed {
     }
 
     fn job<'a>(&'a self, settings: &'a Compression) -> Job<'a> {
-        Job {
-            source: &self.source,
-            capture: self.place.open(&self.recipe),
-            recipe: &self.recipe,
-            settings,
-            exposures: &[],
-        }
+        Job { source: &self.source, capture: self.place.open(&self.recipe), recipe: &self.recipe, settings, run: None }
     }
 
     fn compress(&self, name: &str, settings: &Compression) -> (Compressed, Scene<f32>) {

@@ -27,6 +27,7 @@ use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split,
 use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
+use crate::run::corrected;
 use crate::train_state::{EXPOSURE_COLUMNS, expose};
 use crate::{Error, ErrorKind, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -103,8 +104,8 @@ pub struct EvalOptions {
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
-    /// What the capture's cameras do to the colours, frame by frame ([`crate::run::corrected::exposures`]); empty: nothing.
-    pub exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
+    /// The run whose learnt exposures of photos are applied to what is rendered; `None`: none.
+    pub exposures_of: Option<PathBuf>,
     /// The renderer; the metrics are the CPU's.
     pub device: Device,
 }
@@ -120,7 +121,7 @@ impl Default for EvalOptions {
             measured: Measured::Test,
             place: None,
             align: None,
-            exposures: Vec::new(),
+            exposures_of: None,
             device: Device::Cpu,
         }
     }
@@ -218,7 +219,8 @@ pub fn assess(
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
     let place = options.place.as_deref().unwrap_or(Measured::Test.name());
     let folder = options.folder.join(place).join(format!("ours_{iteration}"));
-    let mut judge = Judge::new(scene, capture, store, lpips, options, stop, listen);
+    let exposures = options.exposures_of.as_deref().map(|run| corrected::exposures(capture, run)).transpose()?;
+    let mut judge = Judge::new(scene, capture, store, lpips, exposures.unwrap_or_default(), options, stop, listen);
     let whole = Views::Whole(options.pictures.then_some(folder.as_path()));
     let name = match options.measured {
         Measured::Test => "evaluating held-out views",
@@ -251,7 +253,8 @@ struct Judge<'a> {
     capture: &'a Capture,
     store: &'a Arc<ImageStore>,
     lpips: Option<Lpips>,
-    exposures: &'a [[f32; EXPOSURE_COLUMNS]],
+    /// By frame.
+    exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
     stop: &'a AtomicBool,
     backend: Box<dyn Backend>,
     /// It in words.
@@ -268,7 +271,8 @@ impl<'a> Judge<'a> {
         capture: &'a Capture,
         store: &'a Arc<ImageStore>,
         lpips: Option<Lpips>,
-        options: &'a EvalOptions,
+        exposures: Vec<[f32; EXPOSURE_COLUMNS]>,
+        options: &EvalOptions,
         stop: &'a AtomicBool,
         listen: &mut dyn FnMut(&Event),
     ) -> Self {
@@ -287,7 +291,7 @@ impl<'a> Judge<'a> {
             capture,
             store,
             lpips,
-            exposures: &options.exposures,
+            exposures,
             stop,
             backend,
             device: if on_cpu { DEVICE.into() } else { name },

@@ -40,7 +40,7 @@ pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Res
 /// similar light. Empty: none was learnt.
 ///
 /// Errors: those of [`read`].
-pub fn exposures(capture: &Capture, run: &Path) -> Result<Vec<[f32; COLUMNS]>> {
+pub(crate) fn exposures(capture: &Capture, run: &Path) -> Result<Vec<[f32; COLUMNS]>> {
     let Some(value) = read(run)? else { return Ok(Vec::new()) };
     let Some(rows) = value["exposures"].as_object() else { return Ok(Vec::new()) };
     let learnt = |frame: &Frame| {
