@@ -23,7 +23,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{TrainOptions, checkpoint};
+use splat4d_train::run::{TrainOptions, checkpoint, corrected};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -326,7 +326,8 @@ impl Work {
                 .remedy("Give a run folder, or make a plain file with `splat4d bake`.")
         })?;
         console.phase("reading the capture", 0, 0);
-        let (capture, recipe) = run.open_capture()?;
+        let (mut capture, recipe) = run.open_capture()?;
+        corrected::apply(&mut capture, &run.path)?;
         let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), run: &run.path };
         let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
         self.choose_size(&original, console)?;

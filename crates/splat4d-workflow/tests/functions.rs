@@ -124,6 +124,32 @@ fn a_capture_is_trained_and_continued_by_functions() {
 }
 
 #[test]
+fn a_compression_uses_the_refined_cameras_of_its_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, small) = (folder.path().join("run"), folder.path().join("small"));
+    let stop = AtomicBool::new(false);
+    let capture = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/knight"));
+    let mut recipe = Recipe::default();
+    let plain = ["motion=still", "iterations=40", "downscale=16", "max_frames=1", "sh_degree=0", "init.count=200"];
+    let refined = ["refine.poses=true", "refine.poses_from=0", "refine.position_init=0.05", "refine.align_steps=0"];
+    plain.iter().chain(&refined).for_each(|setting| recipe.set(setting).unwrap());
+    let options = TrainingOptions { output: Some(run.clone()), ..TrainingOptions::default() };
+    training::train(capture, &recipe, &options, &stop, &ignore).unwrap();
+    let options = CompressOptions { output: Some(small.clone()), fine_tune: Some(8), ..CompressOptions::default() };
+    compress(&run, &CompressOptions { size: [32, 24], ..options }, &stop, &ignore).unwrap();
+
+    let read = |path: &Path| -> serde_json::Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() };
+    let cameras = |of: &Path| read(&of.join("refined.json"))["cameras"].clone();
+    let moved = |row: &serde_json::Value| row["twist"].as_array().unwrap().iter().any(|x| x.as_f64() != Some(0.0));
+    assert!(cameras(&run).as_array().unwrap().iter().any(moved), "the run moves cameras");
+    assert_eq!(cameras(&small), cameras(&run));
+    // What the run measured of its scene is what the compression measured of it.
+    let before = read(&small.join("compress.json"))["before"]["psnr_train"].as_f64().unwrap();
+    let measured = read(&run.join("results.json"))["train"]["ours_40"]["PSNR"].as_f64().unwrap();
+    assert!((before - measured).abs() < 1e-6, "{before} dB, {measured} dB");
+}
+
+#[test]
 fn unwritable_outputs_are_errors() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);

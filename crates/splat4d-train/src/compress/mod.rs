@@ -48,13 +48,14 @@ pub(crate) const VERB: &str = "compress";
 pub struct Job<'a> {
     /// A trained scene.
     pub source: &'a Scene<f32>,
-    /// The capture it was trained on.
+    /// The capture it was trained on, its cameras where the training has moved them ([`corrected::apply`]).
     pub capture: Arc<Capture>,
     /// Record of its training.
     pub recipe: &'a Recipe,
     /// The settings of compression.
     pub settings: &'a Compression,
-    /// The run that learnt the scene, whose exposures of photos are learnt on; `None`: they begin from the identity.
+    /// The run that learnt the scene: its corrections of cameras are handed on, and its exposures of photos are learnt on. `None`: there are
+    /// no corrections, and exposures begin from the identity.
     pub run: Option<&'a Path>,
 }
 
@@ -106,6 +107,9 @@ pub fn compress(
         stop,
         listen,
     )?;
+    if let Some(run) = job.run {
+        corrected::inherit(dir, run)?;
+    }
     let done = !refined.outcome.interrupted;
     let pages = codec.filter(|_| done).map(|codec| codec.pages(&refined.scene, meta(&refined.scene))).transpose()?;
     Ok(Compressed { outcome: refined.outcome, pages })

@@ -94,6 +94,18 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
     if sound { Ok(Some(value)) } else { Err(damage("invalid list of corrections of cameras".into())) }
 }
 
+/// Gives a run that began from another one's scene the corrections of cameras that the other one learnt. Exposures that the run itself has
+/// learnt stay.
+///
+/// Errors: those of [`read`]; the file cannot be written.
+pub(crate) fn inherit(run: &Path, from: &Path) -> Result<()> {
+    let Some(mut value) = read(from)? else { return Ok(()) };
+    if let Some(own) = read(run)?.and_then(|own| own.get("exposures").cloned()) {
+        value["exposures"] = own;
+    }
+    write_atomically(&run.join(FILE), format!("{value:#}\n").as_bytes())
+}
+
 /// A row of the list.
 struct Correction<'a> {
     camera: &'a str,
