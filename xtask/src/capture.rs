@@ -40,18 +40,18 @@ pub(crate) fn bundled_folder() -> PathBuf {
 }
 
 fn rig() -> Vec<Camera> {
-    rig_of(WIDTH, HEIGHT, FOCAL)
+    rig_of(CAMERAS, [WIDTH, HEIGHT], FOCAL)
 }
 
-/// The twenty cameras with images of this size; `focal` in pixels.
-pub(crate) fn rig_of(width: usize, height: usize, focal: f64) -> Vec<Camera> {
+/// Cameras on the arc with images of this size; `focal` in pixels.
+pub(crate) fn rig_of(count: usize, [width, height]: [usize; 2], focal: f64) -> Vec<Camera> {
     let camera = |i: usize| {
-        let degrees = ARC_DEGREES * (i as f64 / (CAMERAS - 1) as f64 - 0.5);
+        let degrees = ARC_DEGREES * (i as f64 / (count - 1) as f64 - 0.5);
         let (sin, cos) = sin_cos(degrees * std::f64::consts::PI / 180.0);
         let position = v3(ARC_RADIUS * sin, ARC_HEIGHTS[i % 2], ARC_RADIUS * cos);
         Camera::look_at(format!("cam{i:02}"), position, ARC_TARGET, focal, width, height)
     };
-    (0..CAMERAS).map(camera).collect()
+    (0..count).map(camera).collect()
 }
 
 /// Data that one image leaves behind for the figures and the ground truth.

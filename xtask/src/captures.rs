@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use std::path::Path;
 
 /// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
-/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER`.
+/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER [--size WxH] [--cameras N]`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = capture::bundled_folder();
     match arguments {
@@ -29,7 +29,7 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         [flag, folder] if flag == "--truth" && !folder.starts_with('-') => {
             capture::write(&home, Path::new(folder), true)
         }
-        [flag, seconds, folder] if flag == "--long" => long::command(seconds, Path::new(folder)),
+        [flag, seconds, folder, options @ ..] if flag == "--long" => long::command(seconds, Path::new(folder), options),
         [flag, folder] if flag == "--videos" => videos::command(Path::new(folder)),
         [] => capture::write(&home, &home, false),
         [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),

@@ -1,8 +1,8 @@
-//! `capture --long SECONDS FOLDER`: the hall with both characters for as long as one likes, filmed by twenty cameras.
-//! Every part circulates at a pace of its own, so that no two times are alike; one frame is in memory at a time.
+//! `capture --long SECONDS FOLDER`: the hall with both characters for as long as one likes, filmed by any number of cameras
+//! at any size. Every part circulates at a pace of its own, so that no two times are alike; one frame is in memory at a time.
 
 use crate::camera::Camera;
-use crate::capture::{CAMERAS, HELD_OUT, bundled_folder, jpeg, rig_of};
+use crate::capture::{self, HELD_OUT, bundled_folder, jpeg, rig_of};
 use crate::files::write_file;
 use crate::material::{BALL, KNIGHT, MAGE};
 use crate::mesh::Mesh;
@@ -12,15 +12,17 @@ use crate::scene::{FPS, Frame, Stage};
 use crate::skin::Character;
 use crate::truth;
 use crate::vector::{Affine, V3, heading, sin_cos, smooth_step, v3};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use rayon::prelude::*;
 use serde_json::json;
 use std::path::Path;
 
-const WIDTH: usize = 200;
-const HEIGHT: usize = 150;
-/// Pixels; gives 67° across.
-const FOCAL: f64 = 150.0;
+/// Focal length, image widths; gives 67° across.
+const FOCAL: f64 = 0.75;
+/// Bounds of an image's sides, pixels.
+const SIDES: std::ops::RangeInclusive<usize> = 16..=8192;
+/// Fewest and most cameras: one of six is held out, and names have two digits.
+const CAMERAS: std::ops::RangeInclusive<usize> = 6..=100;
 /// Most seconds: file names have six digits.
 const MAX_SECONDS: f64 = 999_999.0 / FPS;
 /// Seconds of one round of: the knight's way across and along, his blows, the mage's way across and along, the ball's
@@ -30,18 +32,55 @@ const BALL_RADIUS: f64 = 0.34;
 /// Height of a bounce, scene units.
 const BOUNCE: f64 = 0.67;
 
-/// `--long SECONDS FOLDER`.
-pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
-    let length: f64 = seconds.parse().with_context(|| format!("invalid seconds `{seconds}`"))?;
-    ensure!(length * FPS >= 1.0 && length <= MAX_SECONDS, "give seconds from {:.3} to {MAX_SECONDS:.0}", 1.0 / FPS);
-    let frames = (length * FPS).round() as usize;
+/// What to film.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Wish {
+    frames: usize,
+    size: [usize; 2],
+    cameras: usize,
+}
+
+impl Wish {
+    /// `SECONDS FOLDER [--size WxH] [--cameras N]`, without the folder.
+    fn read(seconds: &str, options: &[String]) -> Result<Self> {
+        let length: f64 = seconds.parse().with_context(|| format!("invalid seconds `{seconds}`"))?;
+        ensure!(length * FPS >= 1.0 && length <= MAX_SECONDS, "give seconds from {:.3} to {MAX_SECONDS:.0}", 1.0 / FPS);
+        let mut wish = Self { frames: (length * FPS).round() as usize, size: [200, 150], cameras: capture::CAMERAS };
+        let mut rest = options.iter();
+        while let Some(option) = rest.next() {
+            let value = rest.next().with_context(|| format!("{option} needs a value"))?;
+            match option.as_str() {
+                "--size" => {
+                    let sides = value.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+                    wish.size = sides.with_context(|| format!("invalid size `{value}`: give it as 1352x1014"))?;
+                }
+                "--cameras" => {
+                    wish.cameras = value.parse().with_context(|| format!("invalid number of cameras `{value}`"))?;
+                }
+                _ => bail!("unknown option {option}: --size WxH and --cameras N are possible"),
+            }
+        }
+        ensure!(wish.size.iter().all(|side| SIDES.contains(side)), "give sides of {SIDES:?} pixels");
+        ensure!(CAMERAS.contains(&wish.cameras), "give {CAMERAS:?} cameras");
+        Ok(wish)
+    }
+
+    fn held_out(self, camera: usize) -> bool {
+        HELD_OUT.contains(&(camera % capture::CAMERAS))
+    }
+}
+
+/// `--long SECONDS FOLDER [--size WxH] [--cameras N]`.
+pub(crate) fn command(seconds: &str, folder: &Path, options: &[String]) -> Result<()> {
+    let wish = Wish::read(seconds, options)?;
+    let (frames, [width, height]) = (wish.frames, wish.size);
     let stage = Stage::load(&bundled_folder().join("characters"))?;
-    let cameras = rig_of(WIDTH, HEIGHT, FOCAL);
+    let cameras = rig_of(wish.cameras, [width, height], FOCAL * width as f64);
     for t in 0..frames {
         let frame = at(&stage, t as f64 / FPS)?;
         cameras.par_iter().try_for_each(|camera| -> Result<()> {
             let rgb = shade(stage.textures(), &frame, camera, &rasterize(&frame.mesh, camera)).rgb;
-            write_file(&folder.join(format!("images/{}/{t:06}.jpg", camera.name)), &jpeg(&rgb, WIDTH, HEIGHT)?)
+            write_file(&folder.join(format!("images/{}/{t:06}.jpg", camera.name)), &jpeg(&rgb, width, height)?)
         })?;
     }
     // Points of the static background: of a long take no time's characters are a useful start.
@@ -53,20 +92,21 @@ pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
             (seen, rgb)
         })
         .collect();
-    let training = (0..CAMERAS).filter(|c| !HELD_OUT.contains(c));
+    let training = (0..wish.cameras).filter(|&c| !wish.held_out(c));
     let training: Vec<_> = training.map(|c| (&cameras[c], &seen[c].0, seen[c].1.as_slice())).collect();
     write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&hall, &training)))?;
     let entry = |camera: &Camera| {
         json!({
-            "name": camera.name, "width": WIDTH, "height": HEIGHT,
-            "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * WIDTH as f64, "cy": 0.5 * HEIGHT as f64,
+            "name": camera.name, "width": width, "height": height,
+            "fx": camera.focal, "fy": camera.focal, "cx": 0.5 * width as f64, "cy": 0.5 * height as f64,
             "world_to_camera": camera.matrix(), "images": format!("images/{}/%06d.jpg", camera.name),
             "start": 0, "frames": frames,
         })
     };
+    let held = cameras.iter().enumerate().filter(|(c, _)| wish.held_out(*c));
     let capture = json!({
         "version": 1, "name": "long", "fps": FPS, "up": [0, 1, 0], "points": "points.ply",
-        "hold_out": {"cameras": HELD_OUT.map(|c| cameras[c].name.clone())},
+        "hold_out": {"cameras": held.map(|(_, camera)| &camera.name).collect::<Vec<_>>()},
         "cameras": cameras.iter().map(entry).collect::<Vec<_>>(),
     });
     // Last: a folder without it is not yet a capture.
@@ -122,14 +162,22 @@ mod tests {
     #[test]
     fn a_capture_has_its_frames_and_moving_objects_stay_between_the_cameras() {
         let folder = tempfile::tempdir().unwrap();
-        command("0.07", folder.path()).unwrap();
+        command("0.07", folder.path(), &[]).unwrap();
         let text = std::fs::read_to_string(folder.path().join("capture.json")).unwrap();
         let capture: serde_json::Value = serde_json::from_str(&text).unwrap();
         assert_eq!((capture["cameras"].as_array().unwrap().len(), &capture["cameras"][0]["frames"]), (20, &json!(2)));
         let picture = |t: usize| std::fs::read(folder.path().join(format!("images/cam08/{t:06}.jpg"))).unwrap();
         assert_ne!(picture(0), picture(1), "it moves");
         for bad in ["0", "-1", "NaN", "1e9", "ten"] {
-            assert!(command(bad, folder.path()).is_err(), "{bad}");
+            assert!(command(bad, folder.path(), &[]).is_err(), "{bad}");
+        }
+        let options = |words: &str| words.split_whitespace().map(String::from).collect::<Vec<_>>();
+        let wish = Wish::read("2", &options("--size 1352x1014 --cameras 12")).unwrap();
+        assert_eq!(wish, Wish { frames: 60, size: [1352, 1014], cameras: 12 });
+        let held: Vec<usize> = (0..20).filter(|&c| wish.held_out(c)).collect();
+        assert_eq!(held, HELD_OUT, "as in the bundled capture");
+        for bad in ["--size 12", "--size 4x4", "--cameras 2", "--cameras", "--fps 3"] {
+            assert!(Wish::read("2", &options(bad)).is_err(), "{bad}");
         }
         for k in 0..400 {
             let p = knight_at(0.37 * f64::from(k));

@@ -62,10 +62,9 @@ chores:
                      pushed-block, bounce,
                              rolling, collision or cloth; true paths of \
                      its nodes and actions next to it, with --truth also depth, flow and labels
-  capture --long \
-                     SECONDS FOLDER
-                             draws a take of any length: twenty cameras, 30 \
-                     frames a second, 200x150, a frame in memory at a time
+  capture --long SECONDS FOLDER [--size WxH] [--cameras N]
+                             draws a take of any length, 30 frames a second, with images of any size (default 200x150) from N cameras \
+                     (default 20); a frame in memory at a time
   strip-character IN.glb OUT.glb CLIP... \
                      [--drop NODE...]
                              keeps the named animation clips of a character, \
