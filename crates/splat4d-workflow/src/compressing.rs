@@ -1,13 +1,14 @@
 //! The work behind `compress`: rounds until size limit and quality guard are met, the file, scores, comparison and
 //! report.
 
+use crate::adopting::{self, OnCapture};
 use crate::baking;
 use crate::draw::antialias;
 use crate::evaluating::{self, Measure};
 use crate::events::{Listener, Recorded};
 use crate::measure::{SIZE, Side, Subject, What, in_turns, measured_views_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
-use crate::run_folder::{self, COMPRESS, ORDER, Run};
+use crate::run_folder::{self, COMPRESS, ORDER, Origin, Run};
 use crate::source::{Source, not_empty, read_scene};
 use crate::{files, playable, report};
 use serde::{Deserialize, Serialize};
@@ -38,9 +39,12 @@ const GENTLER: f64 = 0.5;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompressJob {
-    /// The run that is compressed.
+    /// The run that is compressed, or the scene of another program.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
+    /// The capture of a scene of another program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub on: Option<OnCapture>,
     pub level: u8,
     /// Most dB that training views may lose; 0: no guard.
     pub guard: f64,
@@ -65,6 +69,9 @@ pub const GUARD: f64 = 0.5;
 /// Options of [`compress()`].
 #[derive(Clone, Debug)]
 pub struct CompressOptions {
+    /// The capture that a scene of another program shows; that scene becomes a run in the output's folder `original`.
+    /// `None`: a run is compressed.
+    pub on: Option<OnCapture>,
     /// Output folder. `None`: `RUN-compressed`, or `RUN-compressed-2` and so on if it exists.
     pub output: Option<PathBuf>,
     /// Replace the run in the output folder once the new run has begun.
@@ -99,6 +106,7 @@ pub struct CompressOptions {
 impl Default for CompressOptions {
     fn default() -> Self {
         Self {
+            on: None,
             output: None,
             force: false,
             level: 2,
@@ -148,10 +156,10 @@ impl CompressOptions {
 }
 
 /// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after.
-/// Returns the folder of the result, a run with `scene.s4d` and `report.html`.
+/// With [`on`](CompressOptions::on), `run` is any scene instead: a file, numbered files, an output folder. Returns the folder of the result, a run with `scene.s4d` and `report.html`.
 ///
-/// Errors: the run is unfinished or its capture has moved; options that do not fit together; `stop` was raised, after a
-/// checkpoint was saved ([`resume`] continues).
+/// Errors: the run is unfinished or its capture has moved; no scene; options that do not fit together; `stop` was raised,
+/// after a checkpoint was saved ([`resume`] continues).
 ///
 /// ```no_run
 /// use splat4d_workflow::compressing::{CompressOptions, compress};
@@ -228,13 +236,25 @@ impl Work {
     ///
     /// Errors: the run is unfinished; options that do not fit together; the folder cannot be written, or is not to be.
     pub fn begin(source: &Path, options: &CompressOptions, console: &dyn Listener) -> Result<Self> {
-        let run = Run::open(source)?;
-        if !Run::is_finished(source) {
-            return Err(Run::unfinished(source, "the run is unfinished"));
-        }
-        let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
+        let iterations = match &options.on {
+            Some(on) if Run::is(source) => {
+                return Err(Error::input("it is a run, which has its own capture")
+                    .at(source.display())
+                    .remedy(format!("Leave option `capture` {} out.", on.capture.display())));
+            }
+            Some(on) => on.recipe()?.run.iterations,
+            None if !Run::is(source) && source.exists() => {
+                return Err(Error::input("it is no run: compression needs the images that a scene was trained on")
+                    .at(source.display())
+                    .remedy("State the capture with option `capture`, or make a plain file with `splat4d bake`."));
+            }
+            None => trained_steps(source)?,
+        };
+        let absolute = |path: &Path| std::path::absolute(path).map_err(|e| files::cannot_read(path, e));
+        let on = options.on.clone().map(|on| Ok::<_, Error>(OnCapture { capture: absolute(&on.capture)?, ..on }));
         let order = CompressJob {
-            source: std::path::absolute(source).map_err(|e| files::cannot_read(source, e))?,
+            source: absolute(source)?,
+            on: on.transpose()?,
             level: options.level,
             guard: options.guard,
             max_bytes: options.max_bytes,
@@ -256,9 +276,10 @@ impl Work {
 
     fn place(dir: PathBuf, order: CompressJob, force: bool) -> Result<Self> {
         let asked = order.text();
-        let origin = Run::open(&order.source)?.origin();
-        let mut inputs = vec![Input::new(&order.source, "the run")];
+        let origin = if order.on.is_some() { Origin::default() } else { Run::open(&order.source)?.origin() };
+        let mut inputs = vec![Input::new(&order.source, if order.on.is_some() { "the scene" } else { "the run" })];
         inputs.extend(origin.inputs());
+        inputs.extend(order.on.iter().map(|on| Input::new(&on.capture, "the capture")));
         let request = Request { command: COMMAND, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(&dir, &request)?;
         if found == FolderContent::Unfinished && dir.join(ORDER).is_file() {
@@ -300,6 +321,22 @@ impl Work {
         files::write(&self.dir.join(ORDER), self.order.text().as_bytes())
     }
 
+    /// The run that is compressed: of a scene of another program its copy in this folder.
+    fn original(&self) -> PathBuf {
+        if self.order.on.is_some() { self.dir.join(ORIGINAL) } else { self.order.source.clone() }
+    }
+
+    /// Makes a scene of another program a run, where that has not been done.
+    fn adopt(&self, console: &dyn Listener) -> Result<()> {
+        match &self.order.on {
+            Some(on) if !Run::is_finished(&self.original()) => {
+                console.phase("reading the scene", 0, 0);
+                adopting::adopt(&self.order.source, on, &self.original(), console)
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Compresses, measures and reports. What fails before the first step leaves nothing behind.
     pub fn run(mut self, eval: bool, measure: &Measure, stop: &AtomicBool, console: &dyn Listener) -> Result<PathBuf> {
         let done = self.work(eval, measure, stop, &Recorded::new(console));
@@ -317,14 +354,11 @@ impl Work {
     fn work(&mut self, eval: bool, measure: &Measure, stop: &AtomicBool, recorded: &Recorded<'_>) -> Result<()> {
         let console: &dyn Listener = recorded;
         console.stop_not_polled(&self.kept());
-        let source = Source::open(&self.order.source)?;
+        self.adopt(console)?;
+        let source = Source::open(&self.original())?;
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
-        let run = source.run.as_ref().ok_or_else(|| {
-            Error::input("not a run: compression needs the images that a scene was trained on")
-                .at(self.order.source.display())
-                .remedy("Give a run folder, or make a plain file with `splat4d bake`.")
-        })?;
+        let run = source.run.as_ref().expect("a compression begins with a run");
         console.phase("reading the capture", 0, 0);
         let (mut capture, recipe) = run.open_capture()?;
         corrected::apply(&mut capture, &run.path)?;
@@ -382,7 +416,7 @@ impl Work {
         let smooth = antialias(original.recipe.appearance.antialias);
         let read = |path: &Path| -> Result<Arc<[u8]>> { Ok(files::read(path)?.into()) };
         let file = read(&self.dir.join(playable::FILE))?;
-        let plain = playable::of_run(&self.order.source);
+        let plain = playable::of_run(&self.original());
         let plain = if plain.is_file() { Some(read(&plain)?) } else { None };
         let mut subjects = vec![What::Scene(original.scene), What::File(file)];
         subjects.extend(plain.into_iter().map(What::File));
@@ -555,6 +589,7 @@ impl Work {
         self.order.settings.prune = next;
         self.folder.clear()?;
         self.save()?;
+        self.adopt(console)?;
         Ok(true)
     }
 }
@@ -592,6 +627,18 @@ impl Original<'_> {
 const BESIDES: u64 = 48 << 10;
 /// Margin below the size for another attempt.
 const AGAIN_MARGIN: f64 = 0.01;
+
+/// Training steps of a finished run.
+fn trained_steps(path: &Path) -> Result<usize> {
+    let run = Run::open(path)?;
+    if !Run::is_finished(path) {
+        return Err(Run::unfinished(path, "the run is unfinished"));
+    }
+    Ok(run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1))
+}
+
+/// The folder, in that of a compression, of the run that a scene of another program becomes.
+const ORIGINAL: &str = "original";
 
 /// The folder, in that of a compression, of the unpruned scene that was trained on.
 const UNPRUNED: &str = "unpruned";

@@ -1,5 +1,6 @@
 //! Any scene, of a run or of another program, scored on the views of a capture.
 
+use crate::adopting::OnCapture;
 use crate::evaluating::{Measure, on_backgrounds, print_split};
 use crate::events::Listener;
 use crate::source::{Source, not_empty};
@@ -50,14 +51,9 @@ pub fn score(
     stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
-    let mut recipe = Recipe::default();
-    let wanted = [
-        ("hold_out", options.hold_out.as_ref().map(|v| format!("{v:?}"))),
-        ("downscale", options.downscale.map(|k| k.to_string())),
-    ];
-    for (name, value) in wanted {
-        value.map_or(Ok(()), |value| recipe.set(&format!("{name}={value}")))?;
-    }
+    let shown =
+        OnCapture { capture: capture.to_owned(), hold_out: options.hold_out.clone(), downscale: options.downscale };
+    let mut recipe = shown.recipe()?;
     let on = open_capture(capture, &recipe)?;
     let (first, last) = on.time_range();
     let source = Source::open_on(path, [first, last])?.finite();

@@ -47,6 +47,7 @@
 
 #![allow(missing_docs)] // its interface is not stable yet
 
+pub mod adopting;
 pub mod baking;
 pub mod camera_file;
 pub mod capture_page;

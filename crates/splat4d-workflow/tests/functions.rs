@@ -6,6 +6,7 @@ use splat4d::format::ply::write_placed;
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{GEOMETRY, Params};
 use splat4d_train::recipe::Recipe;
+use splat4d_workflow::adopting::OnCapture;
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::comparison::compare;
 use splat4d_workflow::compressing::{CompressOptions, compress};
@@ -147,6 +148,40 @@ fn a_compression_uses_the_refined_cameras_of_its_run() {
     let before = read(&small.join("compress.json"))["before"]["psnr_train"].as_f64().unwrap();
     let measured = read(&run.join("results.json"))["train"]["ours_40"]["PSNR"].as_f64().unwrap();
     assert!((before - measured).abs() < 1e-6, "{before} dB, {measured} dB");
+}
+
+#[test]
+fn a_scene_of_another_program_is_compressed_on_its_capture() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (scene, stop) = (at("scene.ply"), AtomicBool::new(false));
+    write_scene(&scene);
+    let capture = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/knight")).to_owned();
+    let on = OnCapture { capture, hold_out: Some("camera=cam02".into()), downscale: Some(16) };
+    let options = CompressOptions {
+        on: Some(on.clone()),
+        output: Some(at("small")),
+        prune: Some(0.25),
+        fine_tune: Some(8),
+        size: [32, 24],
+        ..CompressOptions::default()
+    };
+    compress(&scene, &options, &stop, &ignore).unwrap();
+    assert_eq!(Source::open(&at("small/original")).unwrap().scene.len(), GAUSSIANS);
+    assert_eq!(Source::open(&at("small/scene.s4d")).unwrap().scene.len(), GAUSSIANS * 3 / 4);
+    let read = |name: &str| -> serde_json::Value { serde_json::from_slice(&std::fs::read(at(name)).unwrap()).unwrap() };
+    let compared = read("small/compress.json");
+    assert!(compared["before"]["psnr_train"].is_f64() && compared["after"]["psnr_train"].is_f64(), "{compared}");
+    let held = &read("small/per_view.json")["ours_8"]["camera"];
+    assert!(held.as_object().unwrap().values().all(|name| name == "cam02"), "{held}");
+    assert!(scene.is_file() && at("small/report.html").is_file());
+    // Such a folder is a run, which knows its capture.
+    let again = CompressOptions { on: Some(on), output: Some(at("again")), ..CompressOptions::default() };
+    let error = compress(&at("small"), &again, &stop, &ignore).unwrap_err().to_string();
+    assert!(error.contains("Leave option `capture`") && !at("again").exists(), "{error}");
+    let error = compress(&scene, &CompressOptions::default(), &stop, &ignore).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::BadInput, "{error}");
+    assert!(error.to_string().contains("option `capture`"), "{error}");
 }
 
 #[test]

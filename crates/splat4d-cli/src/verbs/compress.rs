@@ -5,6 +5,7 @@ use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
+use splat4d_workflow::adopting::OnCapture;
 use splat4d_workflow::compressing::{CompressOptions, GUARD, Work};
 use splat4d_workflow::device::chosen;
 use splat4d_workflow::measure::SIZE;
@@ -19,6 +20,7 @@ Examples:
   splat4d compress runs/knight --level 1           only quantised and fine-tuned
   splat4d compress runs/knight --set rounds=3 --set temporal=width
   splat4d compress --resume runs/knight-compressed    continue exactly
+  splat4d compress output/room --capture room -o small    a scene that another program trained on this capture
 
 The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after. The original run is \
 unchanged. docs/compression.md explains the settings.";
@@ -27,9 +29,19 @@ unchanged. docs/compression.md explains the settings.";
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub(crate) struct Args {
-    /// The run; its capture must be where it was during training
+    /// The run; its capture must be where it was during training. With --capture any scene: a file, numbered files, an
+    /// output folder
     #[arg(value_name = "RUN", required_unless_present = "resume")]
     run: Option<PathBuf>,
+    /// Capture that a scene of another program was trained on
+    #[arg(long, value_name = "CAPTURE", conflicts_with = "resume", help_heading = "Scenes of other programs")]
+    capture: Option<PathBuf>,
+    /// Views that are held out of --capture, as `train` takes them [default: the capture's convention]
+    #[arg(long, value_name = "VIEWS", requires = "capture", help_heading = "Scenes of other programs")]
+    hold_out: Option<String>,
+    /// Divide the images' size by this with --capture
+    #[arg(long, value_name = "K", requires = "capture", help_heading = "Scenes of other programs")]
+    downscale: Option<usize>,
     /// Output folder [default: RUN-compressed, or RUN-compressed-2 ... if it exists]
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
@@ -92,7 +104,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 
 /// The requested work.
 fn options(args: &Args) -> CompressOptions {
+    let on = args.capture.clone().map(|capture| OnCapture {
+        capture,
+        hold_out: args.hold_out.clone(),
+        downscale: args.downscale,
+    });
     CompressOptions {
+        on,
         output: args.output.clone(),
         force: args.force,
         level: args.level,
