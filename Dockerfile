@@ -16,6 +16,6 @@ LABEL org.opencontainers.image.title="splat4d" \
 RUN apk add --no-cache ffmpeg && adduser -D -u 1000 splat4d
 COPY --from=build /src/target/dist/splat4d /src/target/dist/s4d /usr/local/bin/
 COPY --from=build /src/LICENSE-MIT /src/LICENSE-APACHE /src/target/extras/LICENSE-THIRD-PARTY /usr/share/licenses/splat4d/
-USER splat4d
+USER 1000:1000
 WORKDIR /work
 ENTRYPOINT ["splat4d"]
