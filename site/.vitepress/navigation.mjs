@@ -95,6 +95,7 @@ const MEASUREMENTS = [
 ];
 const PROJECT = [
   ['CONTRIBUTING', 'Contributing'],
+  ['docs/release', 'Release checklist'],
   ['CHANGELOG', 'Changelog'],
 ];
 

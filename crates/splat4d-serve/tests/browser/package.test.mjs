@@ -1,6 +1,6 @@
 // The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the
-// element, and the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core
-// (`.ci/run`).
+// element, and the object of three.js, with meshes before and behind it, in the oldest and the newest three.js that the
+// package accepts. Needs npm, and both next to playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync } from 'node:child_process';
@@ -20,7 +20,9 @@ const KNIGHT = readFileSync(fileURLToPath(new URL('../../../../examples/knight.s
 const MOST = 100_000;
 /// The element and the object against each other, dB: one blends in half floats, the other in the canvas' bytes.
 const ALIKE = 32;
-const THREE = path.join(process.env.PLAYWRIGHT ?? '', 'node_modules/three/build');
+const MODULES = path.join(process.env.PLAYWRIGHT ?? '', 'node_modules');
+/// The newest three.js, and the oldest that `peerDependencies` accept, as `.ci/npm` installs them.
+const THREES = ['three', 'three-oldest'];
 
 const browser = await launch();
 const work = mkdtempSync(path.join(tmpdir(), 'splat4d-npm-'));
@@ -37,9 +39,9 @@ const MAP = { imports: { splat4d: '/splat4d/player/element.js', 'splat4d/three':
 const html = (body) => `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}</style>
   <script type="importmap">${JSON.stringify(MAP)}</script>${body}`;
 
-/// A page of this body, next to the installed package and a scene.
-async function page(body, t) {
-  const folders = { '/splat4d/': installed, '/three/': THREE };
+/// A page of this body, next to the installed package, a scene and a three.js.
+async function page(body, t, three = THREES[0]) {
+  const folders = { '/splat4d/': installed, '/three/': path.join(MODULES, three, 'build') };
   const server = await serve({ files: { 'page.html': html(body), 'knight.s4d': KNIGHT }, folders });
   const opened = await open(browser, server.url + 'page.html', { viewport: { width: 400, height: 300 } });
   t.after(() => Promise.all([opened.page.close(), server.close()]));
@@ -58,7 +60,7 @@ test('the package contains its exports, and is small', (t) => {
   assert.ok(bytes <= MOST);
 });
 
-const needs = (three) => ({ skip: !browser ? 'needs a browser' : three && !existsSync(THREE) ? 'needs three' : false });
+const needs = (three) => ({ skip: !browser ? 'needs a browser' : three && !existsSync(path.join(MODULES, three)) ? `needs ${three}` : false });
 const ELEMENT = `<splat-4d src="/knight.s4d" backend="webgl2" resolution="1" controls="none"
   style="display:block;width:400px;height:300px"></splat-4d><script type="module">import 'splat4d';</script>`;
 /// three.js with the knight, seen by the file's camera \`at\`; the page states \`shown\` when it is drawn.
@@ -98,15 +100,21 @@ const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
   window.shown = true;
 </script>`;
 
-test('an installed element plays', needs(false), async (t) => {
+test('an installed element plays', needs(null), async (t) => {
   const { page: p, errors } = await page(ELEMENT.replace('backend', 'autoplay backend'), t);
   await p.waitForFunction(() => document.querySelector('splat-4d').statistics?.firstFrame > 0, null, { timeout: 60000 });
   await p.waitForFunction(() => document.querySelector('splat-4d').currentTime > 0.1, null, { timeout: 60000 });
   assert.deepEqual(errors, []);
 });
 
-test('the three.js object matches the element, among meshes', needs(true), async (t) => {
-  const { page: p, errors } = await page(OBJECT, t);
+test('the accepted three.js is tested from its oldest version on', needs('three-oldest'), () => {
+  const oldest = JSON.parse(readFileSync(path.join(MODULES, 'three-oldest/package.json'))).version;
+  const { peerDependencies } = JSON.parse(readFileSync(path.join(installed, 'package.json')));
+  assert.equal(`${peerDependencies.three}.0`, `>=${oldest}`);
+});
+
+for (const three of THREES) test(`the object of ${three} matches the element, among meshes`, needs(three), async (t) => {
+  const { page: p, errors } = await page(OBJECT, t, three);
   await p.waitForFunction(() => window.shown, null, { timeout: 60000 });
   const show = (...args) => p.evaluate((a) => window.show(...a), args);
   const [m, fov] = await p.evaluate(() => [window.camera, window.fov]);
