@@ -146,7 +146,7 @@ const UNKNOWN: (f64, f64) = (f64::NAN, 0.0);
 struct Octave {
     blurred: Vec<Planes<f32>>,
     differences: Vec<Planes<f32>>,
-    /// Gradients of the blurred images that were asked for.
+    /// Gradients of the blurred images, computed on first use.
     gradients: Vec<RefCell<Vec<(f64, f64)>>>,
 }
 
