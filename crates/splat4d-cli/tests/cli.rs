@@ -26,6 +26,7 @@ mod trained;
 use sample::{Capture, Output, splat4d};
 use serde_json::{Value, json};
 use splat4d::format::npy::Npy;
+use splat4d::format::playback::{Index, Kind};
 use splat4d::format::ply;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
@@ -639,6 +640,19 @@ fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     assert_eq!(params.len(), 2);
     assert!((params[GEOMETRY].get(1, 0) - 1.1).abs() < 1e-3, "{}", params[GEOMETRY].get(1, 0));
 
+    // Files for a program are those of `convert`.
+    let [exported, converted] = ["exported", "converted"].map(|name| work.path().join(name));
+    splat4d(&["export", str(&file), "--sequence", str(&exported), "--for", "nuke", "--fps", "4"]).run().ok();
+    splat4d(&["convert", str(&file), str(&converted), "--frames", "--for", "nuke", "--fps", "4"]).run().ok();
+    let read = |folder: &Path| std::fs::read(folder.join("frame.0001.ply")).unwrap();
+    assert_eq!(read(&exported), read(&converted));
+    let one = work.path().join("one.ply");
+    splat4d(&["export", str(&file), "-o", str(&one), "--time", "0.3", "--for", "unreal"]).run().ok();
+    let (params, _) = ply::read(&std::fs::read(&one).unwrap()).unwrap();
+    assert_eq!(params.len(), 2);
+    let page = work.path().join("page.html");
+    splat4d(&["export", str(&file), "-o", str(&page), "--for", "unity"]).run().refused();
+
     let mut bytes = std::fs::read(&file).unwrap();
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
@@ -649,6 +663,18 @@ fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     let page = work.path().join("page.html");
     let told = splat4d(&["export", str(&spoilt), "-o", str(&page)]).run().refused();
     assert!(told.contains("checksum") && !page.exists(), "{told}");
+
+    // No command needs the poster; what is wrong with it is reported.
+    let knight = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.s4d")).unwrap();
+    let index = Index::parse(&knight, Some(knight.len() as u64)).unwrap();
+    let poster = index.sections.iter().find(|e| e.kind == Kind::Poster).expect("it has a poster");
+    let mut bytes = knight.clone();
+    bytes[poster.offset as usize + 100] ^= 4;
+    std::fs::write(&spoilt, &bytes).unwrap();
+    let told = splat4d(&["info", str(&spoilt)]).run().ok();
+    assert!(told.contains("poster is damaged") && !told.contains("looks healthy"), "{told}");
+    let told = splat4d(&["info", "--strict", str(&spoilt)]).run().all();
+    assert!(told.contains("checksum of the poster"), "{told}");
 
     // What a file is called is shown, and no terminal obeys it.
     #[cfg(unix)]

@@ -50,7 +50,7 @@ const BAR: usize = 32;
 
 /// Remarks of readers about values that cannot be right; all other remarks are notes. Base colours that are all bright
 /// may be those of a bright scene.
-const DOUBTS: [&str; 8] = [
+const DOUBTS: [&str; 9] = [
     "--linear scales",
     "--linear opacities",
     "RGB from 0 to 255",
@@ -59,6 +59,7 @@ const DOUBTS: [&str; 8] = [
     "a network that splat4d does not read",
     "steps of a training rather than frames",
     "rendered as Gaussians, which looks different",
+    "the poster is damaged",
 ];
 
 /// Options of [`inspect`].

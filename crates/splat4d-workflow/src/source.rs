@@ -7,7 +7,7 @@ use crate::files::{self, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::{Run, check_written};
 use crate::sequence;
-use splat4d::format::playback::{self, Index, Provenance};
+use splat4d::format::playback::{self, Index, Kind, Provenance};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
@@ -126,7 +126,12 @@ impl Source {
             let index = Index::parse(&bytes, Some(bytes.len() as u64)).map_err(|e| e.at(path.display()))?;
             let scene = playback::read(&bytes).map_err(|e| e.at(path.display()))?;
             let provenance = playback::provenance(&bytes).map_err(|e| e.at(path.display()))?;
-            return Ok(Self { playback: Some(index), provenance, ..Self::own(scene) });
+            let mut source = Self { provenance, ..Self::own(scene) };
+            // Everything else was read, and its checksums compared.
+            if index.sections.iter().any(|e| e.kind == Kind::Poster && !e.is_intact(&bytes)) {
+                source.warnings.add("the poster is damaged (its checksum is wrong), the scene is not: bake it again");
+            }
+            return Ok(Self { playback: Some(index), ..source });
         }
         if let Some(source) = bundle::open_archive(path, &bytes)? {
             return Ok(source);

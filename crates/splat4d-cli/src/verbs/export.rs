@@ -2,10 +2,13 @@
 //! positions of Gaussians or of requested points as JSON or CSV.
 
 use crate::console::Console;
+use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use splat4d::Error;
+use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::exporting::{self, Frames, TrackOptions};
 use splat4d_workflow::files;
+use splat4d_workflow::programs::{PROGRAMS, Program};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -13,6 +16,7 @@ Examples:
   splat4d export runs/knight -o now.ply --time 0.5         one time; every 3DGS viewer opens it
   splat4d export runs/knight --sequence frames/            frame_00000.ply ...; SuperSplat plays them
   splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
+  splat4d export runs/knight --sequence frames/ --for unreal            z up, centimetres, left-handed
   splat4d export runs/knight --html -o knight.html         player and scene in one page
   splat4d export runs/knight --html -o index.html --link knight.s4d    for a web server
   splat4d export runs/knight --tracks tracks.csv           positions at every frame; .json too
@@ -93,6 +97,11 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE", requires = "output")]
     link: Option<PathBuf>,
 
+    /// Axes, unit and file names of this program, the same Gaussians in every file of a sequence
+    #[arg(long = "for", value_name = "PROGRAM", value_parser = PossibleValuesParser::new(PROGRAMS.map(|p| p.name)),
+          conflicts_with_all = ["tracks", "html", "label", "link"])]
+    program: Option<String>,
+
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
     model: Option<PathBuf>,
 }
@@ -118,6 +127,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         args.output.as_ref().is_some_and(|o| o.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending)))
     };
     if args.html || named("html") || named("htm") {
+        if args.program.is_some() {
+            return Err(Error::input("--for applies to .ply files")
+                .remedy("Use -o NAME.ply or --sequence FOLDER.")
+                .into());
+        }
         if args.label.is_some() {
             return Err(Error::input("a page shows the whole file")
                 .remedy("First write a file with that label only: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
@@ -141,6 +155,20 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         }
         return Ok(());
     }
+    let program = args.program.as_deref().and_then(Program::of);
+    let conversion = |output: &Path| Conversion {
+        force: args.force,
+        fps: args.fps,
+        from: args.from,
+        to: args.to,
+        world: args.world,
+        program,
+        ..Conversion::new(path, output)
+    };
+    if let (Some(program), Some(folder)) = (program, &args.sequence) {
+        let named = folder.join(program.frame);
+        return Ok(converting::run(&Conversion { frames: true, ..conversion(&named) }, console)?);
+    }
     if let Some(folder) = &args.sequence {
         exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
         return Ok(());
@@ -153,6 +181,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .into());
     }
     let time = args.time.unwrap_or(scene.clip[0]);
+    if program.is_some() {
+        return Ok(converting::run(&Conversion { time: Some(time), ..conversion(out) }, console)?);
+    }
     let n = exporting::moment(scene, time, args.world, out)?;
     exporting::warn_of_empty(scene, time, n, console);
     console.print_line(&format!("{} Gaussians at {time} s", files::grouped(n)));

@@ -9,6 +9,7 @@ use super::{
     Rig, Split, Timing,
 };
 use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig};
+use rayon::prelude::*;
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -149,13 +150,14 @@ const UNKNOWN_DEPTH: f64 = 0.25;
 /// points.
 pub(super) fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
-    let mut depths: Vec<f64> = Vec::new();
-    for view in capture.places() {
-        let inside = |&([u, v], _): &([f64; 2], f64)| {
-            (0.0..view.width as f64).contains(&u) && (0.0..view.height as f64).contains(&v)
-        };
-        depths.extend(cloud.iter().filter_map(|&x| view.project(x)).filter(inside).map(|(_, z)| z));
-    }
+    let views: Vec<&Camera> = capture.places().collect();
+    let of = |view: &&Camera| -> Vec<f64> {
+        let (width, height) = (view.width as f64, view.height as f64);
+        let inside = |&([u, v], _): &([f64; 2], f64)| (0.0..width).contains(&u) && (0.0..height).contains(&v);
+        cloud.iter().filter_map(|&x| view.project(x)).filter(inside).map(|(_, z)| z).collect()
+    };
+    // Most of the time of opening a capture of thousands of images.
+    let mut depths: Vec<f64> = views.par_iter().flat_map_iter(of).collect();
     let at = (STRAY_POINTS * depths.len() as f64) as usize;
     let extent = capture.center_and_radius().1;
     let farthest = match depths.is_empty() {

@@ -7,6 +7,7 @@
 use super::raster::{blurred, doubled, every_second};
 use splat4d::math::mat3::solve;
 use splat4d::scene::Planes;
+use std::cell::RefCell;
 use std::f64::consts::TAU;
 
 /// Numbers of a descriptor: 4 x 4 cells of 8 directions.
@@ -136,10 +137,17 @@ struct Point {
     contrast: f64,
 }
 
+/// Pixels of an octave up to which gradients are kept: 16 MB for each blurred image.
+const KEPT: usize = 1_000_000;
+/// A gradient that was not computed yet.
+const UNKNOWN: (f64, f64) = (f64::NAN, 0.0);
+
 /// An image at growing blur, and the differences of neighbours.
 struct Octave {
     blurred: Vec<Planes<f32>>,
     differences: Vec<Planes<f32>>,
+    /// Gradients of the blurred images, computed on first use.
+    gradients: Vec<RefCell<Vec<(f64, f64)>>>,
 }
 
 impl Octave {
@@ -156,7 +164,8 @@ impl Octave {
             out
         };
         let differences = pictures.windows(2).map(difference).collect();
-        Self { blurred: pictures, differences }
+        let gradients = pictures.iter().map(|_| RefCell::new(Vec::new())).collect();
+        Self { blurred: pictures, differences, gradients }
     }
 
     fn size(&self) -> (usize, usize) {
@@ -169,12 +178,17 @@ impl Octave {
         let mut out = Vec::new();
         for layer in 1..=INTERVALS {
             for y in BORDER..h.saturating_sub(BORDER) {
+                let row = &self.differences[layer].data[y * w..(y + 1) * w];
                 for x in BORDER..w.saturating_sub(BORDER) {
-                    let value = self.differences[layer].data[y * w + x];
+                    let value = row[x];
                     if f64::from(value.abs()) < 0.5 * contrast {
                         continue;
                     }
                     let sign = value.signum();
+                    // Most pixels are no extremum of their own row.
+                    if sign * row[x - 1] > sign * value || sign * row[x + 1] > sign * value {
+                        continue;
+                    }
                     let tops = |d: &Planes<f32>| {
                         (y - 1..=y + 1).all(|v| {
                             d.data[v * w + x - 1..=v * w + x + 1].iter().all(|other| sign * other <= sign * value)
@@ -231,8 +245,30 @@ impl Octave {
         None
     }
 
-    /// Length and direction of the gradient at a pixel of a blurred image; nothing at its border.
+    /// Length and direction of the gradient at a pixel of a blurred image; nothing at its border. Those of small images are kept:
+    /// descriptors of neighbouring points share most of them.
     fn gradient(&self, layer: usize, x: isize, y: isize) -> Option<(f64, f64)> {
+        let (w, h) = self.size();
+        let inside = x > 0 && y > 0 && x < w as isize - 1 && y < h as isize - 1;
+        if w * h > KEPT {
+            return self.new_gradient(layer, x, y);
+        }
+        if !inside {
+            return None;
+        }
+        let mut known = self.gradients[layer].borrow_mut();
+        if known.is_empty() {
+            known.resize(w * h, UNKNOWN);
+        }
+        let kept = &mut known[y as usize * w + x as usize];
+        if kept.0.is_nan() {
+            *kept = self.new_gradient(layer, x, y)?;
+        }
+        Some(*kept)
+    }
+
+    /// [`Self::gradient`], computed.
+    fn new_gradient(&self, layer: usize, x: isize, y: isize) -> Option<(f64, f64)> {
         let (w, h) = self.size();
         let inside = x > 0 && y > 0 && x < w as isize - 1 && y < h as isize - 1;
         inside.then(|| {
@@ -336,6 +372,21 @@ fn shares(k: f64) -> [(isize, f64); 2] {
 mod tests {
     use super::*;
     use splat4d::math::Rng;
+
+    #[test]
+    fn gradients_that_are_kept_are_those_computed() {
+        let mut base = Planes::<f32>::new(1, 30, 40);
+        let rng = Rng::new(2, "noise", 0);
+        base.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(i as u64) as f32);
+        let octave = Octave::new(base);
+        for _ in 0..2 {
+            for (layer, y, x) in
+                (1..=INTERVALS).flat_map(|l| (-1..31).flat_map(move |y| (-1..41).map(move |x| (l, y, x))))
+            {
+                assert_eq!(octave.gradient(layer, x, y), octave.new_gradient(layer, x, y), "{layer} {x} {y}");
+            }
+        }
+    }
 
     #[test]
     fn a_limit_drops_the_weakest_features_and_keeps_the_others() {

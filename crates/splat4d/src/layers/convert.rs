@@ -34,7 +34,7 @@ pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer
 /// A `native4d` layer as a `spacetime` one of order 1 with a `GaussHalf` life: the same image at every time.
 ///
 /// Errors: the layer moves otherwise; its colours change with time, or it has another life in addition to its own.
-pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
+pub(crate) fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
     let Spec::Native4d(spec) = layer.motion.spec() else {
         return Err(cannot("this layer is not of the model native4d", "Give one that is"));
     };

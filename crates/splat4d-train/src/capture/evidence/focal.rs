@@ -3,9 +3,10 @@
 
 use super::super::Capture;
 use super::super::account::Severity;
+use super::super::lens::Distortion;
 use super::super::preflight::Finding;
 use super::Aspect;
-use super::look::{SmallImage, Trial};
+use super::look::{SmallImage, Trial, bent};
 use super::pairs::{self, Match};
 use super::points;
 use splat4d::math::Se3;
@@ -26,11 +27,15 @@ const SHARE: f64 = 0.15;
 /// Largest share of the error as read that matches may have at half or twice the focal length, where they determine it.
 const FLAT: f64 = 0.7;
 /// First radial terms that are tried: barrels of action cameras and of wide lenses, and a cushion.
-const BENDS: [f64; 3] = [-0.3, -0.15, 0.15];
+const BENDS: [f64; 4] = [-0.3, -0.2, -0.12, 0.15];
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;
 /// The same where distortion is left out or added: fewer alternatives agree by chance.
 const STRAIGHTER: f64 = 0.05;
+/// The same where the points are compared that distortion moves.
+const OUTER: f64 = 0.1;
+/// How many times as well matches fit distorted images, where images are distorted.
+const BENT: f64 = 1.3;
 
 /// Results for the tried factors of focal lengths, by steps.
 struct Tried(Vec<f64>);
@@ -99,14 +104,28 @@ fn by_points(capture: &Capture, matches: Option<&[Match]>, images: &[SmallImage]
     }
     let (both, longer) = best(&|times| gain(Trial { times: [times; 2], ..Trial::AS_READ }));
     let (across, wider) = best(&|times| gain(Trial { times: [times, 1.0], ..Trial::AS_READ }));
-    let bent = BENDS.map(|bend| (gain(Trial { bend, ..Trial::AS_READ }), bend));
-    let (bent, bend) = bent.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0.0));
-    if better(bent, STRAIGHTER) && bent >= both.max(across) && !images.iter().any(SmallImage::is_distorted) {
-        let what = format!(
-            "The images are probably distorted, and the cameras are not: {} with k1 = {bend}, {as_read}.",
-            how(bent)
-        );
-        return Some(warned(what, "Undistort the images, or export the cameras with their distortion."));
+    if !images.iter().any(SmallImage::is_distorted) {
+        let whole = BENDS.map(|bend| (gain(Trial { bend, ..Trial::AS_READ }), bend));
+        let (bent, bend) = whole.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0.0));
+        if better(bent, STRAIGHTER) && bent >= both.max(across) {
+            return Some(distorted(bend, &format!("{}, {as_read}", how(bent))));
+        }
+        // Distortion hardly moves the points in the middle of images, which are most.
+        let outer = |(whole, bend): (f64, f64)| {
+            let trial = Trial { bend, ..Trial::AS_READ };
+            let ([read, bent], count) = points::gain_of_moved(capture, images, poses, trial)?;
+            let fits = bent >= points::CONVINCES.1 && bent >= read + OUTER && whole >= both.max(across).max(own);
+            (fits && !few).then_some((bent - read, bend, [read, bent], count))
+        };
+        let best = whole.into_iter().filter_map(outer).max_by(|a, b| a.0.total_cmp(&b.0));
+        if let Some((_, bend, [read, bent], count)) = best {
+            let how = format!(
+                "colours of the {count} points that this moves fit their images by {:.0} %, by {:.0} % as read",
+                percent(bent),
+                percent(read)
+            );
+            return Some(distorted(bend, &how));
+        }
     }
     if wrong(across) && across >= both + COLOURS {
         let what = format!(
@@ -117,6 +136,12 @@ fn by_points(capture: &Capture, matches: Option<&[Match]>, images: &[SmallImage]
         return Some(warned(what, remedy));
     }
     (longer != 1.0 && wrong(both)).then(|| warning(&how(both), longer, images, &as_read))
+}
+
+/// The warning about distorted images of pinhole cameras.
+fn distorted(bend: f64, how: &str) -> Finding {
+    let what = format!("The images are probably distorted, and the cameras are not: with k1 = {bend} {how}.");
+    warned(what, "Undistort the images, or export the cameras with their distortion.")
 }
 
 /// The best result over the factors that are tried, refined by half a step, and its factor.
@@ -135,8 +160,18 @@ fn best(of: &dyn Fn(f64) -> f64) -> (f64, f64) {
 
 fn by_matches(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let weight = |residual: f64| (1.0 - (residual / REACH).powi(2)).max(0.0);
-    let fit = Tried::new(|times| pairs::residuals(matches, images, poses, times).into_iter().map(weight).sum());
+    let fitting = |times: f64, lens: Option<&Distortion>| -> f64 {
+        pairs::residuals(matches, images, poses, times, lens).into_iter().map(weight).sum()
+    };
+    let fit = Tried::new(|times| fitting(times, None));
     let best = fit.best();
+    let bent = BENDS.map(|bend| (fitting(1.0, Some(&bent(bend))), bend));
+    let (bent, bend) = bent.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0.0));
+    let enough = bent >= ENOUGH.max(SHARE * matches.len() as f64);
+    if enough && bent >= BENT * fit.at(0) && bent >= fit.at(best) && !images.iter().any(SmallImage::is_distorted) {
+        let how = format!("matches between images fit {:.1} times as well as read", bent / fit.at(0).max(1.0));
+        return Some(distorted(bend, &how));
+    }
     if fit.at(best) < ENOUGH.max(SHARE * matches.len() as f64) {
         return None;
     }

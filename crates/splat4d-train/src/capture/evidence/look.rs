@@ -3,6 +3,7 @@
 use super::super::lens::Distortion;
 use super::super::picture::{self, Raster, Samples};
 use super::super::{Capture, Frame};
+use super::alpha::Fringe;
 use crate::keypoints::features::{Feature, Limits, find};
 use crate::keypoints::raster::grey;
 use rayon::prelude::*;
@@ -25,7 +26,7 @@ pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
 /// Weight of a mask or alpha from which a pixel shows something.
-const SHOWN: f32 = 0.5;
+pub(super) const SHOWN: f32 = 0.5;
 /// Foreground below this share of an image, or above the other, gives no information on a position.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
@@ -43,6 +44,8 @@ pub(super) struct Shown {
     pub(super) share: f64,
     /// Share of the pixels along its edge.
     pub(super) of_edge: f64,
+    /// Whether a mask states it, not alpha.
+    pub(super) of_mask: bool,
 }
 
 /// A small image.
@@ -61,6 +64,8 @@ pub(super) struct SmallImage {
     pub(super) hidden: Option<[f64; 2]>,
     /// How much of it is shown, by its mask or alpha; `None`: it has none.
     pub(super) shown: Option<Shown>,
+    /// How half-transparent pixels of the file differ from those next to them.
+    pub(super) fringe: Fringe,
     pub(super) marks: Vec<Mark>,
 }
 
@@ -182,12 +187,14 @@ impl SmallImage {
             };
             Some((0..width * height).map(at).collect::<Vec<f32>>())
         };
+        let of_mask = alpha.is_none();
         let weights = alpha.or_else(mask);
+        let fringe = Fringe::of(&raster);
         let lens = Distortion::new(frame.source.lens);
         let camera = frame.source.clone();
         let (foreground, hidden, shown) = (None, None, None);
         let mut look =
-            Self { frame: number, camera, lens, color, factor, foreground, hidden, shown, marks: Vec::new() };
+            Self { frame: number, camera, lens, color, factor, foreground, hidden, shown, fringe, marks: Vec::new() };
         if let Some(weights) = weights {
             look.foreground = look.middle(&weights);
             let rest: Vec<f32> = weights.iter().map(|w| 1.0 - w).collect();
@@ -201,7 +208,7 @@ impl SmallImage {
                 x == 0 || y == 0 || x + 1 == width || y + 1 == height
             };
             let of_edge = share(&mut (0..width * height).filter(on_edge).map(|p| weights[p]));
-            look.shown = Some(Shown { share: share(&mut weights.iter().copied()), of_edge, weights });
+            look.shown = Some(Shown { share: share(&mut weights.iter().copied()), of_edge, of_mask, weights });
         }
         Some(look)
     }
@@ -226,6 +233,32 @@ impl SmallImage {
         self.lens.undistort([(u * f - k.cx) / k.fx, (v * f - k.cy) / k.fy])
     }
 
+    /// Pixels of the small image across and down.
+    pub(super) fn size(&self) -> (usize, usize) {
+        (self.color.width, self.color.height)
+    }
+
+    /// Pixels of the file along one of the small image's.
+    pub(super) fn factor(&self) -> usize {
+        self.factor
+    }
+
+    /// Strength of the edges at every pixel of the small image: differences of neighbours, of all channels; 0 at its border.
+    pub(super) fn edges(&self) -> Vec<f32> {
+        let (width, height) = self.size();
+        let mut out = vec![0.0f32; width * height];
+        for c in 0..3 {
+            let plane = self.color.plane(c);
+            for y in 1..height.saturating_sub(1) {
+                for x in 1..width.saturating_sub(1) {
+                    let p = y * width + x;
+                    out[p] += (plane[p + 1] - plane[p - 1]).abs() + (plane[p + width] - plane[p - width]).abs();
+                }
+            }
+        }
+        out
+    }
+
     /// Focal length of the small image, pixels.
     pub(super) fn focal(&self) -> f64 {
         self.camera.intrinsics.fx / self.factor as f64
@@ -238,10 +271,7 @@ impl SmallImage {
         camera.intrinsics.fy *= trial.times[1];
         let lens = match trial {
             Trial { straight: true, .. } => Distortion::new(Lens::Pinhole),
-            Trial { bend, .. } if bend != 0.0 && !self.is_distorted() => {
-                let k = [bend, 0.0, 0.0, 0.0, 0.0, 0.0];
-                Distortion::new(Lens::Brown { k, p: [0.0; 2], s: [0.0; 4] })
-            }
+            Trial { bend, .. } if bend != 0.0 && !self.is_distorted() => bent(bend),
             _ => self.lens,
         };
         (camera, lens)
@@ -260,13 +290,22 @@ impl SmallImage {
         pose: &Se3,
         point: [f64; 3],
     ) -> Option<[f32; 3]> {
-        let [u, v] = pixel_of(camera, lens, pose, point)?;
+        self.color_at(pixel_of(camera, lens, pose, point)?)
+    }
+
+    /// The colour at a pixel of the file; `None`: outside, or hidden by its mask or alpha.
+    pub(super) fn color_at(&self, [u, v]: [f64; 2]) -> Option<[f32; 3]> {
         let (x, y) = (u as usize / self.factor, v as usize / self.factor);
         let inside = x < self.color.width && y < self.color.height;
         // Points of what was cut out have the colours of another image.
         let shown = |s: &Shown| s.weights[y * self.color.width + x] >= SHOWN;
         (inside && self.shown.as_ref().is_none_or(shown)).then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
     }
+}
+
+/// A lens whose only distortion is the first radial term.
+pub(super) fn bent(k1: f64) -> Distortion {
+    Distortion::new(Lens::Brown { k: [k1, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] })
 }
 
 /// Position of a point in the image file; `None`: behind the camera or outside.

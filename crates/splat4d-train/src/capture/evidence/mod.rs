@@ -4,17 +4,20 @@
 //! Each is measured for the poses as read, and as they would be in other conventions of the layout. A finding needs a
 //! convention that fits clearly better; nothing else raises a warning.
 
+mod alpha;
 mod copies;
 mod focal;
 mod look;
 mod motion;
 mod outliers;
+mod outlines;
 mod pairs;
 mod parts;
 mod points;
 mod silhouettes;
 #[cfg(test)]
 mod tests;
+mod zooms;
 
 use super::account::Severity;
 use super::account::first_names;
@@ -78,6 +81,9 @@ impl Capture {
             check.more.extend(focal::check(self, matches.as_deref(), &images, &poses));
             let fits = check.more.iter().chain([&check.finding]).all(|f| f.severity == Severity::Note);
             check.more.extend(check_masks(&images, &poses));
+            check.more.extend(outlines::check(self, &images));
+            check.more.extend(self.clocks_unchecked());
+            check.more.extend(alpha::check(images.iter().map(|l| l.fringe)));
             check.more.extend(copies::check(self));
             if order.len() > outliers::ALL && fits {
                 let seen: Vec<usize> = images.iter().map(|l| l.frame).collect();
@@ -138,6 +144,18 @@ impl Capture {
             }
         }
         findings
+    }
+
+    /// Motion shows time offsets, over more images than are examined here.
+    fn clocks_unchecked(&self) -> Option<Finding> {
+        let filming: BTreeSet<usize> =
+            self.frames.iter().filter(|f| self.cameras[f.camera].fixed && f.index > 0).map(|f| f.camera).collect();
+        (filming.len() > 1).then(|| Finding {
+            severity: Severity::Note,
+            aspect: Some(Aspect::NotChecked),
+            what: "Whether cameras are a frame early or late: info --doctor compares what moves.".into(),
+            remedy: String::new(),
+        })
     }
 
     /// The verdict by these images, and by the points that the frames `spread` see; features are found and matched if points do not

@@ -9,6 +9,7 @@ use super::super::{Aspect, Capture, Frame};
 use super::look::{self, SmallImage};
 use super::pairs::{self, Match};
 use super::points;
+use super::zooms;
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
@@ -67,13 +68,19 @@ pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>,
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
     let (chosen, compared) = chosen(order, &signs, (pixels / size).max(2 * BESIDE + 1));
     let frames: Vec<usize> = chosen.iter().map(|&k| order[k]).collect();
-    let mut images: Vec<SmallImage> = images.into_iter().filter(|l| frames.contains(&l.frame)).collect();
+    let (mut images, first): (Vec<SmallImage>, Vec<SmallImage>) =
+        images.into_iter().partition(|l| frames.contains(&l.frame));
     let missing: Vec<usize> = frames.iter().copied().filter(|f| images.iter().all(|l| l.frame != *f)).collect();
     images.extend(look::take(capture, &missing, look::COARSE));
     images.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
     let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
     let gain = |l: &SmallImage| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
-    let strange = strange(capture, order, &images, &gain);
+    let others = sampled(capture, order, &images);
+    let all: Vec<&SmallImage> = images.iter().chain(&others).collect();
+    let twice = |l: &&SmallImage| others.iter().all(|o| o.frame != l.frame);
+    let looked_at: Vec<&SmallImage> = all.iter().copied().chain(first.iter().filter(twice)).collect();
+    let zoomed = zooms::check(capture, &looked_at);
+    let strange = strange(capture, order, &all, &gain);
     let vouched = |l: &SmallImage| gain(l).is_some_and(|gain| gain >= VOUCHED);
     let place = |l: &SmallImage| order.iter().position(|f| *f == l.frame).unwrap_or(0);
     let doubtful: Vec<usize> = images.par_iter().filter(|l| !vouched(l)).map(place).collect();
@@ -109,6 +116,9 @@ pub(super) fn check(capture: &Capture, order: &[usize], images: Vec<SmallImage>,
     let mut findings = Vec::new();
     let known: Vec<usize> = wrong.iter().map(|&k| images[k].frame).collect();
     findings.extend(warning(&wrong, &measured, &described));
+    let (zoomed, other_zoom) = zoomed.unzip();
+    let known: Vec<usize> = known.into_iter().chain(other_zoom.into_iter().flatten()).collect();
+    findings.extend(zoomed);
     let strange = strange.filter(|s| !s.frames.iter().any(|f| known.contains(f)));
     let named: Vec<usize> = strange.iter().flat_map(|s| s.frames.clone()).chain(known).collect();
     findings.extend(strange.map(|s| s.finding(capture)));
@@ -180,21 +190,27 @@ impl Strange {
     }
 }
 
-/// Searches for such images among those that were already read and some more.
-fn strange(
-    capture: &Capture,
-    order: &[usize],
-    images: &[SmallImage],
-    gain: &(dyn Fn(&SmallImage) -> Option<f64> + Sync),
-) -> Option<Strange> {
-    capture.points.as_ref()?;
+/// More images to compare with points than those that were read already, evenly chosen.
+fn sampled(capture: &Capture, order: &[usize], images: &[SmallImage]) -> Vec<SmallImage> {
+    if capture.points.is_none() {
+        return Vec::new();
+    }
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
     let most = SEEN.0.min(SEEN.1 / size).max(1);
     let more = order.iter().step_by(order.len().div_ceil(most).max(1)).copied();
     let more: Vec<usize> = more.filter(|f| images.iter().all(|l| l.frame != *f)).collect();
-    let others = look::take(capture, &more, look::COARSE);
-    let all: Vec<&SmallImage> = images.iter().chain(&others).collect();
-    let mut gains: Vec<(f64, usize)> = all.par_iter().filter_map(|l| Some((gain(l)?, l.frame))).collect();
+    look::take(capture, &more, look::COARSE)
+}
+
+/// Searches for such images among these.
+fn strange(
+    capture: &Capture,
+    order: &[usize],
+    images: &[&SmallImage],
+    gain: &(dyn Fn(&SmallImage) -> Option<f64> + Sync),
+) -> Option<Strange> {
+    capture.points.as_ref()?;
+    let mut gains: Vec<(f64, usize)> = images.par_iter().filter_map(|l| Some((gain(l)?, l.frame))).collect();
     gains.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     let middle = gains.get(gains.len() / 2)?.0;
     let low: Vec<(f64, usize)> = gains.iter().copied().take_while(|(g, _)| *g < STRANGE.0).collect();

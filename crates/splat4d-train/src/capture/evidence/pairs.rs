@@ -2,6 +2,7 @@
 
 use super::super::Aspect;
 use super::super::account::Severity;
+use super::super::lens::Distortion;
 use super::super::pose::same_pose;
 use super::super::preflight::Finding;
 use super::look::{Mark, SmallImage};
@@ -178,13 +179,24 @@ fn least(centers: &[[f64; 3]]) -> f64 {
     ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))
 }
 
-/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image;
-/// infinite where the rays do not meet in front of both cameras.
-pub(super) fn residuals(matches: &[Match], images: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
+/// How far every match is from its epipolar line if focal lengths are `times` as long, or images of pinholes are distorted by
+/// `bend`; pixels of the small image. Infinite where the rays do not meet in front of both cameras.
+pub(super) fn residuals(
+    matches: &[Match],
+    images: &[SmallImage],
+    poses: &[Se3],
+    times: f64,
+    bend: Option<&Distortion>,
+) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
     let residual = |m: &Match| {
-        let m = Match { images: m.images, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
+        let rays = m.rays.map(|ray| {
+            let ray = ray.map(|x| x / times);
+            bend.map_or(Some(ray), |lens| lens.undistort(ray))
+        });
+        let [Some(p), Some(q)] = rays else { return f64::INFINITY };
+        let m = Match { images: m.images, rays: [p, q] };
         let [a, b] = m.images;
         let motion = poses[b].after(&poses[a].inverse());
         let in_one_place = norm(motion.translation) <= least;

@@ -398,6 +398,69 @@ pub(super) fn gain_if(capture: &Capture, images: &[SmallImage], poses: &[Se3], t
     gain(capture, &chosen, images, poses, trial)
 }
 
+/// Points that are sampled for single images.
+const OF_ONE: usize = 4 * POINTS;
+
+/// [`gain_if`] of one image, by more points.
+pub(super) fn gain_of_one(capture: &Capture, look: &SmallImage, trial: Trial) -> Option<f64> {
+    let cloud = capture.points.as_ref()?;
+    let chosen: Vec<usize> = (0..cloud.points.len()).step_by(cloud.points.len().div_ceil(OF_ONE).max(1)).collect();
+    let pose = capture.frames[look.frame].source.cam_from_world;
+    gain(capture, &chosen, std::slice::from_ref(look), &[pose], trial).map(|(gain, _)| gain)
+}
+
+/// Pixels of the small image by which a trial moves the points that [`gain_of_moved`] compares.
+const MOVED: f64 = 3.0;
+/// Points that are searched for such, at most: few are near the edges of images.
+const OF_MOVED: usize = 8 * POINTS;
+/// Such points, at least.
+const FEW_MOVED: usize = 120;
+
+/// Gains as read and with other intrinsics, of those points that these move and that both have in the image, and how many those are.
+/// `None`: too few.
+pub(super) fn gain_of_moved(
+    capture: &Capture,
+    images: &[SmallImage],
+    poses: &[Se3],
+    trial: Trial,
+) -> Option<([f64; 2], usize)> {
+    let cloud = capture.points.as_ref()?;
+    let step = cloud.points.len().div_ceil(OF_MOVED).max(1);
+    let mut sums = [[0.0; 2]; 2];
+    let mut count = 0;
+    for (look, pose) in images.iter().zip(poses) {
+        let cameras = [look.tried(Trial::AS_READ), look.tried(trial)];
+        let both = |p: usize| {
+            let at = cameras.each_ref().map(|(camera, lens)| pixel_of(camera, lens, pose, cloud.points[p]));
+            let [Some(a), Some(b)] = at else { return None };
+            let moved = (a[0] - b[0]).hypot(a[1] - b[1]) >= MOVED * look.factor() as f64;
+            let [a, b] = [look.color_at(a), look.color_at(b)];
+            moved.then_some((cloud.colors[p], [a?, b?]))
+        };
+        let seen: Vec<([f32; 3], [[f32; 3]; 2])> = (0..cloud.points.len()).step_by(step).filter_map(both).collect();
+        let n = seen.len();
+        if n < 2 {
+            continue;
+        }
+        for (i, (color, there)) in seen.iter().enumerate() {
+            for (k, [own, other]) in sums.iter_mut().enumerate() {
+                *own += apart(color, &there[k]);
+                for shift in [n / 4, n / 2, 3 * n / 4] {
+                    *other += apart(color, &seen[(i + shift.max(1)) % n].1[k]) / 3.0;
+                }
+            }
+        }
+        count += n;
+    }
+    let informative = sums.iter().all(|[_, other]| *other > 1e-3 * count as f64);
+    (count >= FEW_MOVED && informative).then(|| (sums.map(|[own, other]| 1.0 - own / other), count))
+}
+
+/// Sum of the differences of three channels.
+fn apart(a: &[f32; 3], b: &[f32; 3]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum()
+}
+
 /// How much nearer colours are to the image there than to that at other points, and how many were compared, with
 /// these intrinsics. `None`: points have one colour, or too few are in images.
 fn gain(
@@ -408,7 +471,6 @@ fn gain(
     trial: Trial,
 ) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
-    let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
     // Points of one colour, such as those that have none, carry no information.
     let first = chosen.first().map(|&p| cloud.colors[p])?;

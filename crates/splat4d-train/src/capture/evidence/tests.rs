@@ -1,6 +1,5 @@
 //! Poses in every convention, with and without points: named, and right ones not.
 
-use super::super::lens::Distortion;
 use super::super::tests::samples::Sample;
 use super::super::{CaptureKind, CaptureOptions, Convention, DepthFile, DepthKind};
 use super::*;
@@ -9,6 +8,8 @@ use serde_json::json;
 use splat4d::math::se3::{add, dot, mat_mul, norm, scale, sub, transpose};
 use splat4d::scene::{Camera, Lens};
 use std::sync::OnceLock;
+
+mod silent;
 
 const WIDTH: u32 = 160;
 const HEIGHT: u32 = 120;
@@ -608,29 +609,6 @@ fn images_of_fixed_cameras_are_checked_once() {
     capture.train = (0..capture.frames.len()).collect();
     let cameras: Vec<usize> = capture.looked_at(3).iter().map(|&i| capture.frames[i].camera).collect();
     assert_eq!(cameras, [0, 1, 2]);
-}
-
-/// Images of an action camera whose poses and focal length are those of a pinhole.
-#[test]
-fn distorted_images_of_pinhole_cameras_are_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let lens = Distortion::new(Lens::Brown { k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] });
-    let mut capture = photos(true);
-    for (i, frame) in capture.frames.iter_mut().enumerate() {
-        let back = pose(i).inverse();
-        let color = |x: u32, y: u32| {
-            let at = [(f64::from(x) + 0.5 - 80.0) / FOCAL, (f64::from(y) + 0.5 - 60.0) / FOCAL];
-            let [x, y] = lens.undistort(at)?;
-            let (p, _) = hit(back.translation, sub(back.apply([x, y, 1.0]), back.translation))?;
-            Some(texture(p).map(|v| (v * 255.0).round() as u8))
-        };
-        frame.image = folder.path().join(format!("{i}.png"));
-        ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| Rgb(color(x, y).unwrap_or([90, 120, 200])))
-            .save(&frame.image)
-            .unwrap();
-    }
-    let found = warned(&capture);
-    assert!(found.iter().any(|w| w.contains("images are probably distorted") && w.contains("k1 = -0.3")), "{found:?}");
 }
 
 /// Points that walls hide have other colours than the images there; matches show that poses are right.

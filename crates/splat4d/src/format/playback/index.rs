@@ -411,6 +411,13 @@ impl Header {
 }
 
 impl Entry {
+    /// Whether the section is in these bytes of its file, with its checksum.
+    pub fn is_intact(&self, file: &[u8]) -> bool {
+        let first = usize::try_from(self.offset).ok();
+        let stored = first.and_then(|first| file.get(first..)?.get(..self.stored as usize));
+        stored.is_some_and(|stored| crc(stored) == self.crc)
+    }
+
     /// An optional section of exactly these bytes, at any position.
     pub(super) fn plain(kind: Kind, bytes: &[u8]) -> Self {
         let length = u32::try_from(bytes.len()).expect("a section has less than 4 GiB");

@@ -107,6 +107,7 @@ fn of_section(bytes: &[u8], index: &Index, i: usize, out: &mut Vec<String>) -> R
     let body = &bytes[entry.offset as usize..][..entry.stored as usize];
     let before = i.checked_sub(1).map(|i| i as u32);
     match entry.kind {
+        Kind::Poster if !entry.is_intact(bytes) => out.push("the checksum of the poster is wrong".into()),
         Kind::Other(_) => out.push(format!("`{name}` is not known")),
         Kind::Poster if entry.codec != Codec::Raw || !IMAGES.iter().any(|magic| body.starts_with(magic)) => {
             out.push("the poster is neither JPEG nor PNG".into());
