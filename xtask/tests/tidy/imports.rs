@@ -118,6 +118,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "report",
             "comparison",
             "evaluating",
+            "adopting",
             "foreign",
             "still_baseline",
             "labelling",
