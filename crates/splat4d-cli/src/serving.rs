@@ -53,12 +53,17 @@ impl Place {
 /// Starts a server, prints its address, and opens the browser; that page may edit, or control the run, by the token.
 pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, console: &Console) -> Result<Running> {
     let host = place.host.clone().unwrap_or(config.host);
-    let right = if config.editing.is_some() { "edit" } else { "control" };
+    let right = match (&config.editing, &config.assist) {
+        (Some(_), _) => "edit",
+        (_, Some(_)) => "assist",
+        _ => "control",
+    };
+    let what = if config.assist.is_some() { "page" } else { "player" };
     let running =
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
     // Behind `#` a browser sends nothing to other sites, and linked pages do not see it.
     let url = token.map_or(running.url().to_owned(), |token| format!("{}#{right}={token}", running.url()));
-    console.print_line(&format!("the player is at {url}"));
+    console.print_line(&format!("the {what} is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
         console.warn("every computer that reaches this machine over the network can view the scene.");

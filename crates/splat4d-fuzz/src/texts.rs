@@ -232,7 +232,10 @@ mod tests {
     fn seeds_are_sound() {
         in_folder(corrections::FILE, CORRECTIONS.as_bytes(), |folder| {
             let read = Corrections::read(folder, &["a".into(), "b".into()]).unwrap();
-            assert_eq!(read.given_offsets(), [Some(0.5), None]);
+            assert_eq!(
+                read.cameras.iter().map(corrections::Camera::given_offset).collect::<Vec<_>>(),
+                [Some(0.5), None]
+            );
         });
         for (i, rig) in rigs().iter().enumerate() {
             in_folder("rig", rig, |folder| {

@@ -103,7 +103,7 @@ fn yes() -> bool {
 
 impl Camera {
     /// One of which nothing is known yet.
-    pub fn new(name: impl Into<String>) -> Self {
+    pub(crate) fn new(name: impl Into<String>) -> Self {
         Self {
             name: name.into(),
             wanted: true,
@@ -255,17 +255,16 @@ impl Corrections {
         let body = toml::to_string(self).expect("corrections are plain data");
         write_atomically(&folder.join(FILE), format!("{HEAD}{body}").as_bytes())
     }
-
-    /// Offsets of all cameras given by the user.
-    pub fn given_offsets(&self) -> Vec<Option<f64>> {
-        self.cameras.iter().map(Camera::given_offset).collect()
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::sync::graph::Kind;
+
+    fn given(file: &Corrections) -> Vec<Option<f64>> {
+        file.cameras.iter().map(Camera::given_offset).collect()
+    }
 
     fn names() -> Vec<String> {
         ["left", "right"].map(String::from).to_vec()
@@ -275,7 +274,7 @@ mod tests {
     fn results_are_written_and_corrections_are_kept() {
         let folder = tempfile::tempdir().unwrap();
         let mut file = Corrections::read(folder.path(), &names()).unwrap();
-        assert_eq!(file.given_offsets(), [None, None]);
+        assert_eq!(given(&file), [None, None]);
         let offset = Offset { seconds: 0.25, sigma: 1e-3, rate: 2e-5, kinds: vec![Kind::Sound], checked: true };
         let intrinsics = Intrinsics { fx: 900.0, fy: 900.0, cx: 640.5, cy: 360.0 };
         let lens = Lens::Brown { k: [-0.1, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] };
@@ -298,7 +297,7 @@ mod tests {
         let right = right.replacen("keep_lens = false", "keep_lens = true", 1).replacen("fx = 900.0", "fx = 950.0", 1);
         std::fs::write(&path, format!("{head}name = \"right\"{right}")).unwrap();
         let mut again = Corrections::read(folder.path(), &names()).unwrap();
-        assert_eq!(again.given_offsets(), [None, Some(0.75)]);
+        assert_eq!(given(&again), [None, Some(0.75)]);
         again.cameras[1].found_offset(&offset);
         again.cameras[1].found_lens(&intrinsics, &Lens::Pinhole);
         let (told, bent) = again.cameras[1].given_lens().unwrap();

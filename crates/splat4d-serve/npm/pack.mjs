@@ -23,7 +23,7 @@ function lean(text) {
 rmSync(to, { recursive: true, force: true });
 for (const name of readdirSync(from)) {
   // The shaders' own files are in shaders.js already.
-  if (OWN.includes(name) || name.startsWith('edit') || !name.endsWith('.js')) continue;
+  if (OWN.includes(name) || ['edit', 'assist'].some((own) => name.startsWith(own)) || !name.endsWith('.js')) continue;
   mkdirSync(to, { recursive: true });
   writeFileSync(new URL(name, to), lean(readFileSync(new URL(name, from), 'utf8')));
 }

@@ -98,3 +98,15 @@ export function pick(accept, onfile) {
   const input = h('input', { type: 'file', accept, onchange: () => input.files[0] && onfile(input.files[0]) });
   input.click();
 }
+
+/** The token to edit, to control a run or to align cameras, from the address that the program printed. It leaves the address bar and stays for this tab. */
+export function leave(right) {
+  const kept = f => { try { return f(sessionStorage); } catch { return null; /* Storage may be shut; the address then serves once. */ } };
+  const given = new URLSearchParams(location.hash.slice(1)), found = given.get(right);
+  if (!found) return kept(s => s.getItem(`splat4d-${right}`));
+  given.delete(right);
+  kept(s => s.setItem(`splat4d-${right}`, found));
+  const rest = decodeURIComponent(given.toString());
+  history.replaceState(null, '', location.pathname + location.search + (rest ? `#${rest}` : ''));
+  return found;
+}

@@ -1,7 +1,7 @@
 // The page around the element: reads what to show, from the page itself or from the server next to it.
 
 import './element.js';
-import { shown } from './dom.js';
+import { leave, shown } from './dom.js';
 
 async function config() {
   if (globalThis.SPLAT4D_CONFIG) return globalThis.SPLAT4D_CONFIG;
@@ -13,18 +13,6 @@ async function config() {
     const answer = await fetch('./config.json');
     return answer.ok ? await answer.json() : {};
   } catch { return {}; }
-}
-
-/** The token to edit or to control a run, from the address that the program printed. It leaves the address bar and stays for this tab. */
-function leave(right) {
-  const kept = f => { try { return f(sessionStorage); } catch { return null; /* Storage may be shut; the address then serves once. */ } };
-  const given = new URLSearchParams(location.hash.slice(1)), found = given.get(right);
-  if (!found) return kept(s => s.getItem(`splat4d-${right}`));
-  given.delete(right);
-  kept(s => s.setItem(`splat4d-${right}`, found));
-  const rest = decodeURIComponent(given.toString());
-  history.replaceState(null, '', location.pathname + location.search + (rest ? `#${rest}` : ''));
-  return found;
 }
 
 const about = await config();

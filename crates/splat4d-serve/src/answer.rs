@@ -1,6 +1,6 @@
 //! Responds to requests: fixed routes, with headers that restrict what a browser may do with the responses.
 
-use crate::assets::{self, Asset, INDEX};
+use crate::assets::{self, ASSIST, Asset, INDEX};
 use crate::body::Body;
 use crate::edit::{self, Editing};
 use crate::events::Hub;
@@ -47,6 +47,8 @@ pub(crate) struct Shared {
     pub editing: Option<Editing>,
     /// Permission to pause and stop a run.
     pub control: Option<Editing>,
+    /// Permission to send clicked points.
+    pub assist: Option<Editing>,
     pub photos: Option<Photos>,
     listeners: Arc<Semaphore>,
     policy: HeaderValue,
@@ -65,6 +67,7 @@ impl Shared {
             player_folder: None,
             editing: None,
             control: None,
+            assist: None,
             photos: None,
             listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
             policy: policy.parse().expect("an origin was checked"),
@@ -88,6 +91,7 @@ pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming
     let editing = match request.uri.path() {
         edit::ROUTE => shared.editing.as_ref(),
         edit::CONTROL_ROUTE => shared.control.as_ref(),
+        edit::ASSIST_ROUTE => shared.assist.as_ref(),
         _ => None,
     };
     let mut response = match (shared.guard.check(request, editing.is_some()), editing) {
@@ -125,7 +129,7 @@ async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
         "metrics.json" => whole(shared.hub.json(), "application/json"),
         "events" => events(shared, request),
         photos::ROUTE => photo(shared, request).await,
-        "" => player(shared, INDEX, &request.headers).await,
+        "" => player(shared, if shared.assist.is_some() { ASSIST } else { INDEX }, &request.headers).await,
         name => player(shared, name.strip_prefix("player/").unwrap_or(name), &request.headers).await,
     }
 }

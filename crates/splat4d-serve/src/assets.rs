@@ -17,6 +17,9 @@ macro_rules! player {
 /// Every file of `player/` that a browser fetches: the shaders' own files are in `shaders.js` already.
 const FILES: &[(&str, &str)] = player![
     "assets.js",
+    "assist.html",
+    "assist.js",
+    "assist-view.js",
     "camera.js",
     "constants.js",
     "controls.js",
@@ -56,6 +59,8 @@ const FILES: &[(&str, &str)] = player![
 
 /// The page.
 pub(crate) const INDEX: &str = "index.html";
+/// The page of manual alignment.
+pub(crate) const ASSIST: &str = "assist.html";
 
 /// A file of the player.
 #[derive(Clone, Debug)]
@@ -160,6 +165,7 @@ mod tests {
     /// addition.
     const MOST: usize = 95_000;
     const MOST_EDITOR: usize = 20_000;
+    const MOST_ASSIST: usize = 12_000;
 
     fn folder() -> std::path::PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("player")
@@ -196,13 +202,15 @@ mod tests {
         // A page imports the editor with `view --edit` only, so that there are two sizes.
         let player = reached(INDEX, "edit.js");
         let editor: BTreeSet<_> = reached("edit.js", INDEX).difference(&player).copied().collect();
+        let assist: BTreeSet<_> = reached(ASSIST, INDEX).difference(&player).copied().collect();
         let all: BTreeSet<&str> = assets().iter().map(|a| &*a.name).collect();
-        assert_eq!(player.union(&editor).copied().collect::<BTreeSet<_>>(), all, "a page reaches every file");
+        let every = player.iter().chain(&editor).chain(&assist).copied().collect::<BTreeSet<_>>();
+        assert_eq!(every, all, "a page reaches every file");
         let size = |names: &BTreeSet<&str>| names.iter().map(|n| asset(n).unwrap().gzip.len()).sum::<usize>();
-        let sizes = [size(&player), size(&editor)];
+        let sizes = [size(&player), size(&editor), size(&assist)];
         assert!(
-            sizes[0] <= MOST && sizes[1] <= MOST_EDITOR,
-            "player and editor {sizes:?} bytes: {player:?} {editor:?}"
+            sizes[0] <= MOST && sizes[1] <= MOST_EDITOR && sizes[2] <= MOST_ASSIST,
+            "player, editor and alignment {sizes:?} bytes: {player:?} {editor:?} {assist:?}"
         );
     }
 

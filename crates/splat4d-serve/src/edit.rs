@@ -25,6 +25,8 @@ use tokio::sync::{Semaphore, oneshot};
 pub(crate) const ROUTE: &str = "/edit";
 /// Route that pauses and stops a live run.
 pub(crate) const CONTROL_ROUTE: &str = "/control";
+/// Route of points that were clicked for an import.
+pub(crate) const ASSIST_ROUTE: &str = "/assist";
 /// The header that holds the token.
 const TOKEN: &str = "x-splat4d-token";
 /// Most bytes that a page may send: ten thousand steps of a hundred bytes.

@@ -15,6 +15,7 @@
 //! | `/metrics.json` | the events up to now, as one document |
 //! | `/photo` | an image of the capture, by camera and time, only with [`Config::photos`] |
 //! | `POST /control` | only with [`Config::control`]: pauses and stops a live run, by the rules of `/edit` |
+//! | `POST /assist` | only with [`Config::assist`]: points clicked for an import, by the same rules; `/` is then the page of manual alignment |
 //! | `POST /edit` | only with [`Config::editing`]: requests of a page with the token for a list of edits |
 //!
 //! ```no_run

@@ -11,8 +11,8 @@ use std::fmt::Write;
 
 /// Largest scene inside a page, bytes. As text it is a third larger, and browsers hold at most half a gigabyte of it.
 const MOST_INSIDE: usize = 256 << 20;
-/// Modules whose names begin so need a server that takes edits.
-const EDITING: &str = "edit";
+/// Modules whose names begin so need a server that takes input.
+const SERVED: [&str; 2] = ["edit", "assist"];
 /// Bytes of the scene a text line: base64 lines of a length that decodes quickly, a multiple of 3.
 const LINE: usize = 3 << 14;
 
@@ -40,7 +40,7 @@ impl Page<'_> {
     pub fn html(&self) -> Result<String> {
         let modules: BTreeMap<&str, &str> = assets()
             .iter()
-            .filter(|a| a.name.ends_with(".js") && !a.name.starts_with(EDITING))
+            .filter(|a| a.name.ends_with(".js") && !SERVED.iter().any(|s| a.name.starts_with(s)))
             .map(|a| (&*a.name, &*a.text))
             .collect();
         let index = &crate::asset(INDEX).expect("the page is embedded").text;

@@ -71,6 +71,8 @@ pub struct Config {
     pub editing: Option<Editing>,
     /// Permission for pages to pause and stop a live run, by the same rules.
     pub control: Option<Editing>,
+    /// Permission for the page of manual alignment to send points, by the same rules; `/` is then that page.
+    pub assist: Option<Editing>,
     /// Images of the capture's cameras.
     pub photos: Option<Photos>,
     /// Whether to step back for other work of this machine (Linux only).
@@ -90,6 +92,7 @@ impl Default for Config {
             live: false,
             editing: None,
             control: None,
+            assist: None,
             photos: None,
             background: false,
             player_folder: None,
@@ -129,7 +132,7 @@ impl Server {
         let mut shared = Shared::new(scene, guard, config.about, config.live, foreign);
         shared.player_folder = config.player_folder;
         (shared.editing, shared.control) = (config.editing, config.control);
-        shared.photos = config.photos;
+        (shared.assist, shared.photos) = (config.assist, config.photos);
         let shared = Arc::new(shared);
         let (stop, stopped) = watch::channel(false);
         let at_work = shared.clone();

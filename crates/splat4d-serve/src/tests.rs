@@ -599,6 +599,22 @@ fn posts_are_refused_unless_editing_is_enabled() {
 }
 
 #[test]
+fn points_are_sent_by_the_rules_of_edits_from_a_page_of_their_own() {
+    let assist = Editing::new(TOKEN.into(), |value| Ok(EditResponse { result: json!({"got": value}), scene: None }));
+    let server = start(Config { assist: Some(assist), ..Config::default() });
+    let page = get(&server, "/");
+    assert!(String::from_utf8_lossy(&page.body).contains("assist.js") || page.header("content-encoding").is_some());
+    for headers in [&[("x-splat4d-token", "0123")][..], &[("origin", "http://evil.example")]] {
+        assert_eq!(post(&server, "/assist", headers, b"{}").status, 403, "{headers:?}");
+    }
+    assert_eq!(post(&server, "/assist", &[], b"{}").body, br#"{"got":{}}"#);
+    assert_eq!(post(&server, "/edit", &[], b"{}").status, 405);
+    let player = start(Config::default());
+    assert_eq!(post(&player, "/assist", &[], b"{}").status, 405);
+    assert!(!String::from_utf8_lossy(&get(&player, "/").body).contains("assist.js"));
+}
+
+#[test]
 fn a_run_is_controlled_by_the_rules_of_edits() {
     let asked: Arc<std::sync::Mutex<Vec<Value>>> = Arc::default();
     let heard = asked.clone();

@@ -54,23 +54,13 @@ pub struct Imported {
 /// # }
 /// ```
 pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn Listener) -> Result<Imported> {
+    let _owned = claimed(request)?;
     let folder = &request.folder;
-    check_ours(folder)?;
-    let read = request.inputs.iter().chain(&request.masks).map(|v| Input::new(v, "what is imported,"));
-    // A capture may be next to the videos, in the folder of their calibration.
-    let calibration = request.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
-    check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
-    // Before videos are read, which takes a while.
-    request.calibration.iter().try_for_each(|c| calibration::read(c).map(drop))?;
-    let _owned = OutputFolder::amend(folder, "import")?;
     console.stop_not_polled("stored results are kept, and the same command continues from there");
     let mut listen = |event: &Event| console.event(event);
     let made = recording::import(request, &mut Progress(&mut listen), &|| stop.load(Ordering::SeqCst));
     console.clear();
-    let report = made.map_err(|e| match e.kind() {
-        ErrorKind::Interrupted => e,
-        _ => e.at("import"),
-    })?;
+    let report = made.map_err(placed)?;
     let checked = if check {
         let capture = open_capture(folder, &Recipe::default())?;
         Some(doctor::made(&capture, &folder.join("import"), console)?)
@@ -79,6 +69,27 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     };
     warnings(&report).iter().for_each(|w| console.warn(w));
     Ok(Imported { report, checked })
+}
+
+/// An error of an import.
+pub(crate) fn placed(e: Error) -> Error {
+    match e.kind() {
+        ErrorKind::Interrupted => e,
+        _ => e.at("import"),
+    }
+}
+
+/// Takes the folder of a request, if it may be written.
+pub(crate) fn claimed(request: &Request) -> Result<OutputFolder> {
+    let folder = &request.folder;
+    check_ours(folder)?;
+    let read = request.inputs.iter().chain(&request.masks).map(|v| Input::new(v, "what is imported,"));
+    // A capture may be next to the videos, in the folder of their calibration.
+    let calibration = request.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
+    check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
+    // Before videos are read, which takes a while.
+    request.calibration.iter().try_for_each(|c| calibration::read(c).map(drop))?;
+    OutputFolder::amend(folder, "import")
 }
 
 /// Messages about cameras.

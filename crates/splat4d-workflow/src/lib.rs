@@ -43,11 +43,13 @@
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
+//! | `aligning.rs` | points clicked in a page, for an import |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
 #![allow(missing_docs)] // its interface is not stable yet
 
 pub mod adopting;
+pub mod aligning;
 pub mod baking;
 pub mod camera_file;
 pub mod capture_page;

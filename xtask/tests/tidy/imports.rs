@@ -67,7 +67,19 @@ const ORDER: [(&str, &[&str]); 9] = [
     ),
     (
         "crates/splat4d-import",
-        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "shipped", "recording", "doctor"],
+        &[
+            "board",
+            "calibration",
+            "video",
+            "sync",
+            "sfm",
+            "clicks",
+            "corrections",
+            "write",
+            "shipped",
+            "recording",
+            "doctor",
+        ],
     ),
     (
         "crates/splat4d-serve",
@@ -131,6 +143,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "editing",
             "picking",
             "editor",
+            "aligning",
             "texts",
         ],
     ),

@@ -2,12 +2,17 @@
 
 use crate::console::Console;
 use crate::interrupt;
+use crate::serving::{self, Place};
+use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
 use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
+use splat4d_workflow::aligning::Aligning;
 use splat4d_workflow::importing::import;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -17,6 +22,7 @@ Examples:
   splat4d import videos/ -o my-take --apart left,right=2.4    lengths in metres
   splat4d import videos/ -o my-take --board 36h11:0.16:floor    an AprilTag of 16 cm on the floor
   splat4d import videos/ -o my-take --calibration Calib.toml    known poses; offsets and points are found
+  splat4d import videos/ -o my-take --assist    cameras at right angles: click points in a local page
 
 my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
 the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";
@@ -75,6 +81,12 @@ pub(crate) struct Args {
     /// Find lenses and poses by the COLMAP program, if it is installed
     #[arg(long, conflicts_with = "calibration")]
     colmap: bool,
+    /// Click the same points in all cameras in a local page, for cameras that share too few features
+    #[arg(long, conflicts_with = "colmap")]
+    assist: bool,
+    /// Use the clicked points of this file, without a page; with --assist, start the page from it
+    #[arg(long, value_name = "FILE", conflicts_with = "colmap")]
+    points: Option<PathBuf>,
     /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
@@ -87,6 +99,15 @@ pub(crate) struct Args {
     /// Skip the check of the finished capture (doctor)
     #[arg(long)]
     no_doctor: bool,
+    /// Port of the page of --assist; 0: any free one [default: 4440, or a free one after it]
+    #[arg(long, value_name = "N", requires = "assist")]
+    port: Option<u16>,
+    /// Print the address of the page and open no browser
+    #[arg(long, requires = "assist")]
+    no_open: bool,
+    /// Read the page from this folder, for its development
+    #[arg(long, value_name = "DIR", hide = true)]
+    player_folder: Option<PathBuf>,
 }
 
 fn apart(text: &str) -> Result<([String; 2], f64), String> {
@@ -122,8 +143,32 @@ fn height(text: &str) -> Result<(String, f64), String> {
     Ok((name.trim().to_owned(), metres))
 }
 
+/// Serves the page until its user finishes; the file of the points.
+fn clicked(request: &Request, place: &Place, stop: &AtomicBool, console: &Console) -> anyhow::Result<PathBuf> {
+    /// How often a finished page is noticed.
+    const POLL: Duration = Duration::from_millis(50);
+    /// Time for the last response to reach the page.
+    const FAREWELL: Duration = Duration::from_millis(250);
+    let (aligning, config) = Aligning::begin(request, stop, console)?;
+    let running = serving::start_for(config, place, Some(aligning.token()), console)?;
+    let file = aligning.file().to_owned();
+    console.print_line("click points in the page and press Finish; Ctrl-C stops, and clicked points are kept");
+    while !aligning.is_finished() {
+        if stop.load(Ordering::SeqCst) {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped")
+                .remedy("Run the same command again: the page shows the points again.")
+                .into());
+        }
+        std::thread::sleep(POLL);
+    }
+    std::thread::sleep(FAREWELL);
+    running.stop();
+    console.print_line(&format!("points: {} (again without the page: --points)", file.display()));
+    Ok(file)
+}
+
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let request = Request {
+    let mut request = Request {
         inputs: args.videos.clone(),
         folder: args.output.clone(),
         selection: Selection {
@@ -150,8 +195,14 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         colmap: args.colmap,
         masks: args.masks.clone(),
         synchronous: args.synchronous,
+        points: args.points.clone(),
     };
     let stop = interrupt::flag("stopping: stored results are kept");
+    if args.assist {
+        let (port, player_folder) = (args.port, args.player_folder.clone());
+        let place = Place { port, host: None, no_open: args.no_open, player_folder };
+        request.points = Some(clicked(&request, &place, &stop, console)?);
+    }
     let imported = import(&request, !args.no_doctor, &stop, console)?;
     if console.json() {
         console.emit(&imported.json());

@@ -2,7 +2,7 @@
 
 use crate::sample::splat4d;
 use crate::{json_of, str};
-use serde_json::Value;
+use serde_json::{Value, json};
 use splat4d::math::align::apart;
 use splat4d_train::capture::{Capture, CaptureOptions};
 use std::path::{Path, PathBuf};
@@ -241,6 +241,103 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     let why = refused(&at("strange.toml"));
     assert!(why.contains("strange3") && why.contains("cam07"), "{why}");
     assert!(refused(&at("missing.toml")).contains("missing.toml"));
+}
+
+/// Cameras 45 to 63 degrees apart, which share too few features.
+const APART: [(&str, usize); 4] = [("cam00", 1), ("cam07", 0), ("cam12", 3), ("cam19", 2)];
+
+/// Where the bundled cameras show points of the scene, as the page of `--assist` saves it, with a quarter of a pixel of noise.
+fn clicked() -> Value {
+    let capture = json_of(&bundled().join("capture.json"));
+    let all = capture["cameras"].as_array().unwrap();
+    let click = |k: usize, (name, _): &(&str, usize), x: [f64; 3]| {
+        let camera = all.iter().find(|c| c["name"] == **name).unwrap();
+        let number = |key: &str| camera[key].as_f64().unwrap();
+        let row = |i: usize| camera["world_to_camera"][i].as_array().unwrap();
+        let at =
+            |i: usize| (0..3).map(|j| row(i)[j].as_f64().unwrap() * x[j]).sum::<f64>() + row(i)[3].as_f64().unwrap();
+        let noise = |a: usize| 0.25 * ((17 * k + 5 * a) as f64).sin();
+        let (u, v) = (number("fx") * at(0) / at(2) + number("cx"), number("fy") * at(1) / at(2) + number("cy"));
+        json!({"camera": name, "x": u + noise(0), "y": v + noise(1), "time": 0.0})
+    };
+    // Corners of a room's size around the knight; y is up.
+    let places = [
+        [-1.0, 0.0, -1.0],
+        [1.0, 0.0, -1.0],
+        [1.0, 0.0, 1.0],
+        [-1.0, 0.0, 1.0],
+        [-0.5, 1.5, 0.2],
+        [0.6, 2.0, -0.3],
+        [0.1, 1.0, 0.7],
+        [-0.8, 0.8, -0.6],
+        [0.9, 1.2, 0.4],
+    ];
+    let point = |(k, x): (usize, &[f64; 3])| {
+        let clicks: Vec<Value> = APART.iter().enumerate().map(|(c, camera)| click(4 * k + c, camera, *x)).collect();
+        json!({"name": format!("p{k}"), "clicks": clicks})
+    };
+    let points: Vec<Value> = places.iter().enumerate().map(point).collect();
+    let sizes: serde_json::Map<String, Value> =
+        APART.iter().map(|(n, _)| ((*n).to_owned(), json!([400, 300]))).collect();
+    // Frame 4 of the bundled capture.
+    let event: serde_json::Map<String, Value> =
+        APART.iter().map(|(n, begin)| ((*n).to_owned(), json!((4 - begin) as f64 / 30.0))).collect();
+    json!({
+        "version": 1, "cameras": sizes, "event": event, "points": points, "floor": ["p0", "p1", "p2", "p3"],
+        "length": {"points": ["p0", "p2"], "metres": 8f64.sqrt()},
+    })
+}
+
+#[test]
+fn clicked_points_place_cameras_that_share_no_features() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let (films, take, points) = (at("films"), at("take"), at("points.json"));
+    filmed_by(&APART, 8, &films);
+    std::fs::write(&points, clicked().to_string()).unwrap();
+    let alone = splat4d(&["import", str(&films), "-o", str(&at("alone")), "--no-doctor"]).args(&SMALL).run().refused();
+    assert!(alone.contains("--assist"), "{alone}");
+    let args = ["import", str(&films), "-o", str(&take), "--points", str(&points), "--no-doctor"];
+    let said = splat4d(&args).args(&SMALL).run().ok();
+    assert!(
+        said.contains("9 clicked points") && said.contains("clicked floor") && said.contains("clicked length"),
+        "{said}"
+    );
+    let open = |path: &Path| Capture::open(path, &CaptureOptions::default()).unwrap();
+    let (found, truth) = (open(&take), open(&bundled()));
+    let poses = |capture: &Capture| {
+        let of = |(name, _): &(&str, usize)| {
+            let frame = capture.frames.iter().find(|f| capture.cameras[f.camera].name == *name).unwrap();
+            frame.view.cam_from_world
+        };
+        APART.iter().map(of).collect::<Vec<_>>()
+    };
+    for (off, (name, _)) in apart(&poses(&found), &poses(&truth)).unwrap().iter().zip(APART) {
+        assert!(off.degrees < 1.0 && off.center < 0.01, "{name}: {off:?}");
+    }
+    let report = json_of(&take.join("import/report.json"));
+    for (k, (name, begin)) in APART.iter().enumerate() {
+        let offset = |k: usize| report["cameras"][k]["offset"].as_f64().unwrap();
+        let off = (offset(k) - offset(0)) * 30.0 - (*begin as f64 - APART[0].1 as f64);
+        assert!(off.abs() < 1e-3, "{name}: {off} frames off");
+    }
+    // Metres, and z upwards from the floor.
+    let height = poses(&found)[1].inverse().translation[2];
+    assert!((height - 3.3).abs() < 0.05, "{height}");
+
+    let refused = |change: &dyn Fn(&mut Value)| {
+        let mut all = clicked();
+        change(&mut all);
+        std::fs::write(&points, all.to_string()).unwrap();
+        splat4d(&["import", str(&films), "-o", str(&take), "--points", str(&points)]).args(&SMALL).run().refused()
+    };
+    let few = refused(&|all| all["points"].as_array_mut().unwrap().truncate(5));
+    assert!(few.contains("click 1 more") && few.contains("--assist"), "{few}");
+    let shape = refused(&|all| all["cameras"]["cam07"] = json!([400, 400]));
+    assert!(shape.contains("400x400") && shape.contains("cam07"), "{shape}");
+    let wrong = refused(&|all| all["points"][0]["clicks"][0]["camera"] = json!("cam99"));
+    assert!(wrong.contains("cam99") && wrong.contains("cam07"), "{wrong}");
+    assert!(splat4d(&["import", str(&films), "-o", str(&take), "--no-open"]).run().refused().contains("--assist"));
 }
 
 /// A program that notes how it is called and, as the mapper, copies a model to where it is requested.

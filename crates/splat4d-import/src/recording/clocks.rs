@@ -151,8 +151,9 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
     ))
     .remedy(
         "If one trigger drives all cameras, use --synchronous. Otherwise set offsets in import.toml (offset, \
-         keep_offset = true) and run the same command again: existing results are kept. Next time record sound and \
-         clap, or let two cameras at most 20 degrees apart see the same motion for a second.",
+         keep_offset = true) and run the same command again: existing results are kept. Or mark one event in all \
+         cameras (--assist, docs/assist.md). Next time record sound and clap, or let two cameras at most 20 degrees \
+         apart see the same motion for a second.",
     ))
 }
 

@@ -4,6 +4,7 @@
 //! offsets that sound leaves open, and offsets and poses are solved in turn until both converge. Results are stored in
 //! [`corrections::FILE`], where they can be corrected before the next run.
 
+mod assist;
 mod cache;
 mod clocks;
 mod colmap;
@@ -19,15 +20,17 @@ mod tags;
 mod way;
 mod world;
 
+pub use assist::Desk;
 pub(crate) use inputs::{Input, find};
 pub use report::{CameraReport, Report};
 pub use spacing::Gap;
 
 use crate::board::Board;
 use crate::calibration::Video;
+use crate::clicks::Clicks;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
-use crate::sync::graph::Evidence;
+use crate::sync::graph::{self, Evidence};
 use crate::video::{self, Cropping, Selection, Source};
 use crate::write::{self, Clip, Format, Pictures, Recording};
 use crate::{Error, ErrorKind, Result};
@@ -79,6 +82,8 @@ pub struct Request {
     pub masks: Option<PathBuf>,
     /// Whether one clock drives all cameras, so that their files' times are taken.
     pub synchronous: bool,
+    /// Points that the user clicked (`Desk`), which give poses, focal lengths and time offsets.
+    pub points: Option<PathBuf>,
 }
 
 /// Pixels of the shorter side that images get: training on a CPU resolves no more.
@@ -105,6 +110,7 @@ impl Request {
             colmap: false,
             masks: None,
             synchronous: false,
+            points: None,
         }
     }
 }
@@ -125,6 +131,8 @@ const FEW_POINTS: usize = 50;
 const CONTRADICTS: f64 = 5.0;
 /// A calibration that more than this part of the judged cameras contradict belongs to another recording.
 const CONTRADICTED: f64 = 0.67;
+/// The remedy where images of fixed cameras have too few matches.
+const BY_HAND: &str = "or click a few points in all cameras (--assist, docs/assist.md); or ";
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -136,97 +144,10 @@ struct Camera {
 /// Errors: inputs that cannot be read, cameras that share no time, images that do not show one scene, no space; of kind
 /// `Interrupted` if `stop` requested it. What was stored until then is kept, and the same request continues from there.
 pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Report> {
-    request.selection.check()?;
     let folder = &request.folder;
-    let mut cameras = open(request)?;
-    let names: Vec<String> = cameras.iter().map(|c| c.name.clone()).collect();
-    std::fs::create_dir_all(folder)
-        .map_err(|e| Error::environment("the folder cannot be created", e).at(folder.display()))?;
-    let mut corrections = Corrections::read(folder, &names)?;
-    let mut wanted = corrections.cameras.iter().map(|c| c.wanted);
-    cameras.retain(|_| wanted.next().unwrap_or(true));
-    let mut told =
-        corrections.cameras.iter().filter(|c| c.wanted).map(corrections::Camera::given_offset).collect::<Vec<_>>();
-    told.resize(cameras.len(), None);
-    if request.synchronous {
-        told.iter_mut().for_each(|t| *t = t.or(Some(0.0)));
-    }
-    if cameras.is_empty() {
-        return Err(Error::input("all cameras are left out").at(folder.join(corrections::FILE).display()));
-    }
-    let measured =
-        request.apart.iter().flat_map(|(pair, _)| pair).chain(request.camera_height.iter().map(|(name, _)| name));
-    for name in measured {
-        if !cameras.iter().any(|c| c.name == *name) {
-            let known: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
-            return Err(Error::input(format!("there is no camera \"{name}\", for which a distance is given"))
-                .remedy(format!("Cameras are {}.", known.join(", "))));
-        }
-    }
-    if usize::from(request.apart.is_some())
-        + usize::from(request.board.is_some())
-        + usize::from(request.camera_height.is_some())
-        > 1
-    {
-        return Err(Error::input("the scale is given in two ways")
-            .remedy("Give one of them: the distance of two cameras, tags, or a height."));
-    }
-    let moving = match request.rig {
-        Rig::Auto => cameras.len() == 1,
-        Rig::Fixed => false,
-        Rig::Moving => true,
-    };
-    let still =
-        request.rig == Rig::Auto && moving && fixed::is_fixed(&*cameras[0].source, &request.selection, progress, stop)?;
-    if cameras.len() == 1 && (!moving || still) {
-        let why = if still { "the background of the images stays in place: " } else { "" };
-        return Err(Error::input(format!("{why}one fixed camera gives no depth"))
-            .remedy("Give the videos of at least two cameras, or use --rig moving if this camera moved."));
-    }
-    // It can be corrected even if the calibration does not fit.
-    corrections.write(folder)?;
-    if request.colmap && (moving || request.calibration.is_some()) {
-        let why = if moving { "cameras move" } else { "a calibration is given" };
-        return Err(Error::input(format!("COLMAP poses were requested, but {why}")).remedy(
-            "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
-        ));
-    }
-    let mut given = given::Given::read(request, &cameras, moving)?;
-    let mut report = Report::default();
-    report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
-    let cache = cache::Cache::of(folder);
-    let heard = if request.sound && cameras.len() > 1 && told.iter().any(Option::is_none) {
-        clocks::by_sound(&cameras, &cache, progress, stop)?
-    } else {
-        Vec::new()
-    };
-    let clock = clocks::solve(&cameras, &heard, &told);
-    let mut selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
-    crop(request, &cameras, &mut selections, &mut report, progress, stop)?;
-    let clips: Vec<Clip<'_>> = cameras
-        .iter()
-        .zip(selections)
-        .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
-        .collect();
-    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue.");
-    // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
-    let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)
-        .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
-    for p in &pictures {
-        if p.shots.is_empty() {
-            return Err(Error::input("the chosen part contains no frame")
-                .at(format!("camera {}", p.name))
-                .remedy("Choose another part, or leave the camera out."));
-        }
-    }
-    if stop() {
-        return Err(stopped());
-    }
-    let begins: Vec<write::Begin> = clips.iter().map(|c| write::Begin { from: c.selection.from }).collect();
-    let masks = match &request.masks {
-        Some(from) => write::masks(folder, from, &pictures, &begins, progress, stop)?,
-        None => Vec::new(),
-    };
+    let all = material(request, progress, stop)?;
+    let Material { cameras, mut corrections, kept, mut told, clicks, moving, mut given, .. } = all;
+    let Material { mut report, cache, heard, mut clock, mut pictures, masks, .. } = all;
     if request.colmap {
         let bare = stored::Stored::new(folder, &pictures, &[], &masks);
         let found = colmap::calibrate(&bare, progress, stop)?;
@@ -236,7 +157,14 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         report.guesses.extend(found.notes.iter().cloned());
         given = Some(found);
     }
-    let known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
+    let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
+    let mut clicked = None;
+    if let Some(clicks) = &clicks {
+        let placed = assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?;
+        told.iter_mut().zip(&placed.offsets).for_each(|(t, o)| *t = o.or(*t));
+        clock = clocks::solve(&cameras, &heard, &told);
+        clicked = Some(placed.origin);
+    }
     let stored = stored::Stored::new(folder, &pictures, &known, &masks);
     let mut evidence = heard;
     let mut moves = None;
@@ -260,16 +188,161 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         }
     })?;
     if stop() {
-        return Err(stopped());
+        return Err(interrupted());
     }
-    let found = Solution { stored: &stored, given, solved, evidence: &evidence, told: &told, moves };
+    let found = Solution { stored: &stored, given, clicked, solved, evidence: &evidence, told: &told, moves };
     finish(request, found, &mut corrections, report, progress)
+}
+
+/// What an import works with: cameras, corrections, and stored images.
+struct Material {
+    cameras: Vec<Camera>,
+    corrections: Corrections,
+    /// Whether the user gives an offset.
+    kept: Vec<bool>,
+    /// Offsets that the user gives, and those of a clicked event.
+    told: Vec<Option<f64>>,
+    /// Points that the user clicked.
+    clicks: Option<Clicks>,
+    moving: bool,
+    given: Option<given::Given>,
+    report: Report,
+    cache: cache::Cache,
+    heard: Vec<Evidence>,
+    clock: graph::Solution,
+    pictures: Vec<Pictures>,
+    masks: Vec<write::Masks>,
+}
+
+fn interrupted() -> Error {
+    Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue.")
+}
+
+/// Opens the cameras, and stores the images of the time that they share.
+fn material(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Material> {
+    request.selection.check()?;
+    let folder = &request.folder;
+    let mut cameras = open(request)?;
+    let names: Vec<String> = cameras.iter().map(|c| c.name.clone()).collect();
+    std::fs::create_dir_all(folder)
+        .map_err(|e| Error::environment("the folder cannot be created", e).at(folder.display()))?;
+    let corrections = Corrections::read(folder, &names)?;
+    let mut wanted = corrections.cameras.iter().map(|c| c.wanted);
+    cameras.retain(|_| wanted.next().unwrap_or(true));
+    let mut told =
+        corrections.cameras.iter().filter(|c| c.wanted).map(corrections::Camera::given_offset).collect::<Vec<_>>();
+    told.resize(cameras.len(), None);
+    if request.synchronous {
+        told.iter_mut().for_each(|t| *t = t.or(Some(0.0)));
+    }
+    let kept: Vec<bool> = told.iter().map(Option::is_some).collect();
+    if cameras.is_empty() {
+        return Err(Error::input("all cameras are left out").at(folder.join(corrections::FILE).display()));
+    }
+    let measured =
+        request.apart.iter().flat_map(|(pair, _)| pair).chain(request.camera_height.iter().map(|(name, _)| name));
+    for name in measured {
+        if !cameras.iter().any(|c| c.name == *name) {
+            let known: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
+            return Err(Error::input(format!("there is no camera \"{name}\", for which a distance is given"))
+                .remedy(format!("Cameras are {}.", known.join(", "))));
+        }
+    }
+    if usize::from(request.apart.is_some())
+        + usize::from(request.board.is_some())
+        + usize::from(request.camera_height.is_some())
+        > 1
+    {
+        return Err(Error::input("the scale is given in two ways")
+            .remedy("Give one of them: the distance of two cameras, tags, or a height."));
+    }
+    let clicks = match &request.points {
+        Some(file) => {
+            let here: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
+            let clicks = assist::read(file, request, &names, &here)?;
+            told = clicks.offsets(&here, &told);
+            Some(clicks)
+        }
+        None => None,
+    };
+    let moving = match request.rig {
+        Rig::Auto => cameras.len() == 1,
+        Rig::Fixed => false,
+        Rig::Moving => true,
+    };
+    let still =
+        request.rig == Rig::Auto && moving && fixed::is_fixed(&*cameras[0].source, &request.selection, progress, stop)?;
+    if cameras.len() == 1 && (!moving || still) {
+        let why = if still { "the background of the images stays in place: " } else { "" };
+        return Err(Error::input(format!("{why}one fixed camera gives no depth"))
+            .remedy("Give the videos of at least two cameras, or use --rig moving if this camera moved."));
+    }
+    // It can be corrected even if the calibration does not fit.
+    corrections.write(folder)?;
+    if request.colmap && (moving || request.calibration.is_some()) {
+        let why = if moving { "cameras move" } else { "a calibration is given" };
+        return Err(Error::input(format!("COLMAP poses were requested, but {why}")).remedy(
+            "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
+        ));
+    }
+    let given = given::Given::read(request, &cameras, moving)?;
+    let mut report = Report::default();
+    report.guesses.extend(given.iter().flat_map(|g| g.notes.iter().cloned()));
+    let cache = cache::Cache::of(folder);
+    let heard = if request.sound && cameras.len() > 1 && told.iter().any(Option::is_none) {
+        clocks::by_sound(&cameras, &cache, progress, stop)?
+    } else {
+        Vec::new()
+    };
+    let clock = clocks::solve(&cameras, &heard, &told);
+    let mut selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
+    crop(request, &cameras, &mut selections, &mut report, progress, stop)?;
+    let clips: Vec<Clip<'_>> = cameras
+        .iter()
+        .zip(selections)
+        .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
+        .collect();
+    // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
+    let pictures = write::pictures(folder, &clips, request.format, progress, stop)
+        .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { interrupted() } else { e })?;
+    for p in &pictures {
+        if p.shots.is_empty() {
+            return Err(Error::input("the chosen part contains no frame")
+                .at(format!("camera {}", p.name))
+                .remedy("Choose another part, or leave the camera out."));
+        }
+    }
+    if stop() {
+        return Err(interrupted());
+    }
+    let begins: Vec<write::Begin> = clips.iter().map(|c| write::Begin { from: c.selection.from }).collect();
+    let masks = match &request.masks {
+        Some(from) => write::masks(folder, from, &pictures, &begins, progress, stop)?,
+        None => Vec::new(),
+    };
+    Ok(Material {
+        cameras,
+        corrections,
+        kept,
+        told,
+        clicks,
+        moving,
+        given,
+        report,
+        cache,
+        heard,
+        clock,
+        pictures,
+        masks,
+    })
 }
 
 /// All that was found.
 struct Solution<'a> {
     stored: &'a stored::Stored<'a>,
     given: Option<given::Given>,
+    /// Floor and unit of clicked points.
+    clicked: Option<world::Origin>,
     solved: poses::Solved,
     /// Lags of pairs, and given offsets.
     evidence: &'a [Evidence],
@@ -302,10 +375,11 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
             .collect();
         let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join("; ")) };
         return Err(Error::input(format!("only {placed} of {asked} {what} could be placed{reasons}")).remedy(format!(
-            "{}Place neighbouring cameras at most {} degrees apart, in focus and well lit (docs/filming.md); or leave \
+            "{}Place neighbouring cameras at most {} degrees apart, in focus and well lit (docs/filming.md); {}leave \
              these out (use = false in {}) and run the same command again.",
             angles(&report.gaps),
             spacing::FAR,
+            if solved.moving { "or " } else { BY_HAND },
             corrections::FILE
         )));
     }
@@ -416,7 +490,7 @@ fn crop(
     let Some(cropping) = request.crop else { return Ok(()) };
     for (k, (camera, selection)) in cameras.iter().zip(selections).enumerate() {
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
+            return Err(interrupted());
         }
         selection.crop = match cropping {
             Cropping::At(crop) => Some(crop),
@@ -470,11 +544,12 @@ fn finish(
     progress: &mut Progress<'_>,
 ) -> Result<Report> {
     let folder = &request.folder;
-    let Solution { stored, given, mut solved, evidence, told, moves } = found;
+    let Solution { stored, given, clicked, mut solved, evidence, told, moves } = found;
     let pictures = stored.pictures;
     let posed = given.as_ref().is_some_and(|g| g.posed);
     // COLMAP's own axes and unit are those of some camera.
     let origin = match &given {
+        _ if clicked.is_some() => clicked.expect("it is there"),
         Some(g) if g.posed && !request.colmap => world::Origin::Calibrated { metres: g.metres },
         _ => world::Origin::Free,
     };

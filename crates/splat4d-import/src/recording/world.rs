@@ -16,10 +16,12 @@ const ALONG_AXIS: f64 = 0.966;
 const REPORTED: f64 = 1.0;
 
 /// Source of the world's axes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Origin {
     /// A calibration, whose axes and lengths stay; whether these are metres.
     Calibrated { metres: bool },
+    /// Clicked points: normal and centre of the floor, and whether a length among them is known.
+    Clicked { floor: Option<([f64; 3], [f64; 3])>, metres: bool },
     /// None: axes and unit are arbitrary.
     Free,
 }
@@ -35,14 +37,16 @@ pub(super) fn settle(
     report: &mut Report,
     progress: &mut Progress<'_>,
 ) -> Result<bool> {
+    let mut scale = 1.0;
     let found = request.board.as_ref().map(|b| tags::measured(b, stored, solved, progress)).transpose()?;
     if let Some(found) = &found {
-        solved.place(&Sim3 { scale: found.scale, ..Sim3::default() });
+        scale = found.scale;
+        solved.place(&Sim3 { scale, ..Sim3::default() });
         report.guesses.push(found.about());
     }
     if let Some((pair, metres)) = &request.apart {
-        let by = apart(solved, stored, pair, *metres)?;
-        solved.place(&Sim3 { scale: by, ..Sim3::default() });
+        scale = apart(solved, stored, pair, *metres)?;
+        solved.place(&Sim3 { scale, ..Sim3::default() });
     }
     let laid = found.as_ref().and_then(|f| f.frame);
     if let Some((up, origin)) = laid {
@@ -52,6 +56,13 @@ pub(super) fn settle(
         let place =
             if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "on the floor" } else { "on the wall" };
         report.guesses.push(format!("The up direction (+z) and the origin are those of the board {place}."));
+    } else if let Origin::Clicked { floor: Some((up, middle)), .. } = origin {
+        let turned = turn(solved, up, true);
+        let at = mat_vec(&turned.rotation, middle.map(|v| v * scale));
+        solved.place(&Sim3 { translation: at.map(|v| -v), ..Sim3::default() });
+        report
+            .guesses
+            .push("The up direction (+z) is the normal of the clicked floor, which contains the origin.".into());
     } else if let Origin::Calibrated { .. } = origin {
         match along_axis(solved.up) {
             Some((axis, name)) => {
@@ -82,13 +93,14 @@ pub(super) fn settle(
         ));
     }
     let told = found.is_some() || request.apart.is_some() || request.camera_height.is_some();
-    if !told && (origin == Origin::Free || request.colmap) {
+    let free = matches!(origin, Origin::Free | Origin::Clicked { metres: false, .. });
+    if !told && (free || request.colmap) {
         report.guesses.push(format!(
             "The unit of length is {}. For metres, give the distance of two cameras (--apart A,B=METRES) or film tags (--board).",
             if request.colmap { "COLMAP's" } else { "the median distance of the cameras from the points" }
         ));
     }
-    Ok(told || origin == Origin::Calibrated { metres: true })
+    Ok(told || matches!(origin, Origin::Calibrated { metres: true } | Origin::Clicked { metres: true, .. }))
 }
 
 /// Rotates the world so that z is upwards and x and y are along walls, if there are any, with cameras looking along y.

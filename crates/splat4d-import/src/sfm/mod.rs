@@ -148,7 +148,7 @@ fn solve_sights(
     let alone = || {
         Error::input("no two of these images show the same scene").remedy(
             "Film one scene with neighbouring cameras at most 20 degrees apart, in focus and well lit \
-             (docs/filming.md).",
+             (docs/filming.md); or click a few points in all cameras (--assist, docs/assist.md).",
         )
     };
     if links.is_empty() {

@@ -9,7 +9,7 @@ use splat4d::math::{Rng, Se3};
 use std::sync::LazyLock;
 
 /// A position as the first and the second image show it.
-pub type Pair = [[f64; 2]; 2];
+pub(crate) type Pair = [[f64; 2]; 2];
 
 /// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of
 /// them with any chance.
@@ -22,7 +22,7 @@ fn long([x, y]: [f64; 2]) -> [f64; 3] {
 }
 
 /// Squared first-order distance of a pair from a fundamental matrix (Sampson 1982), in the pair's unit.
-fn sampson(f: &Mat3, &[a, b]: &Pair) -> f64 {
+pub(crate) fn sampson(f: &Mat3, &[a, b]: &Pair) -> f64 {
     let (a, b) = (long(a), long(b));
     let forth = mat_vec(f, a);
     let back = mat_vec(&transpose(f), b);
@@ -166,7 +166,7 @@ static PRODUCTS: LazyLock<[[usize; 20]; 20]> = LazyLock::new(|| {
 
 /// The essential matrices of five pairs of rays (depth 1): b·E·a = 0, det E = 0 and 2 E Eᵀ E = tr(E Eᵀ) E (Nistér 2004,
 /// "An efficient solution to the five-point relative pose problem").
-pub fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
+pub(crate) fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
     let rows: Vec<[f64; 9]> = sample.iter().map(row).collect();
     let null = null_space(&rows);
     let place = &*PRODUCTS;

@@ -24,7 +24,7 @@ const LOBE: usize = 4;
 
 /// How much moved when.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Motion {
+pub(crate) struct Motion {
     /// Seconds on the camera's clock: the middles between frames.
     times: Vec<f64>,
     /// Mean absolute change of grey a median interval.
@@ -45,7 +45,7 @@ pub(crate) struct MotionLag {
 
 impl Motion {
     /// Takes the next frame.
-    pub fn push(&mut self, time: f64, picture: &Rgb8) {
+    pub(crate) fn push(&mut self, time: f64, picture: &Rgb8) {
         let grey = Grey::of(picture);
         let small = grey.reduced((grey.width.max(grey.height) / SIDE).max(1));
         if let Some((before, last)) = &self.last
