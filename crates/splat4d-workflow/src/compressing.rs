@@ -244,7 +244,7 @@ impl Work {
             }
             Some(on) => on.recipe()?.run.iterations,
             None if !Run::is(source) && source.exists() => {
-                return Err(Error::input("it is no run: compression needs the images that a scene was trained on")
+                return Err(Error::input("not a run: compression needs the images that a scene was trained on")
                     .at(source.display())
                     .remedy("State the capture with option `capture`, or make a plain file with `splat4d bake`."));
             }
