@@ -6,6 +6,7 @@ use splat4d::Error;
 use splat4d::edit::{Edits, Expr};
 use splat4d_dynamics::actions::Actions;
 use splat4d_import::calibration;
+use splat4d_import::check_clicks;
 use splat4d_import::corrections::{self, Corrections};
 use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
@@ -25,6 +26,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "actions", seeds: actions, read: |b| drop(Actions::parse(&text(b))) },
     Reader { name: "calibration", seeds: calibrations, read: calibration },
     Reader { name: "calibration_rig", seeds: rigs, read: calibration },
+    Reader { name: "clicks", seeds: || seeds(&[CLICKS]), read: clicks },
     Reader { name: "compress_toml", seeds: || seeds(&[ORDER]), read: |b| drop(texts::compress_order(&text(b))) },
     Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
     Reader { name: "edit_request", seeds: requests, read: edit_request },
@@ -143,6 +145,11 @@ fn rigs() -> Vec<Vec<u8>> {
 const ORDER: &str = "source = \"runs/a\"\nlevel = 1\nguard = 0.1\nasked = false\nunpruned = false\nfree = true\n\n[settings]\nprune = 0.2\nrounds = 1\n";
 
 /// `import.toml`, as written.
+const CLICKS: &str = r#"{"version": 1, "cameras": {"a": [64, 48], "b": [64, 48]}, "event": {"a": 0.4, "b": 0.5},
+    "points": [{"name": "corner", "clicks": [{"camera": "a", "x": 8.5, "y": 9, "time": 0.4}, {"camera": "b", "x": 3, "y": 40.25, "time": 0.5}]},
+    {"name": "post", "clicks": [{"camera": "a", "x": 60, "y": 1, "time": 0.4}]}, {"name": "mat", "clicks": []},
+    {"name": "hand", "moment": 0.9, "clicks": [{"camera": "b", "x": 31, "y": 7, "time": 0.9}]}],
+    "floor": ["corner", "mat", "post"], "length": {"points": ["corner", "post"], "metres": 2.0}}"#;
 const CORRECTIONS: &str = "version = 1\n[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";
 
 thread_local! {
@@ -163,6 +170,10 @@ fn corrections(bytes: &[u8]) {
             read.cameras.iter().for_each(|c| assert!(c.given_offset().is_none_or(f64::is_finite)));
         }
     });
+}
+
+fn clicks(bytes: &[u8]) {
+    in_folder("points.json", bytes, |folder| drop(check_clicks(&folder.join("points.json"), &["a", "b"])));
 }
 
 fn requests() -> Vec<Vec<u8>> {
@@ -230,6 +241,9 @@ mod tests {
 
     #[test]
     fn seeds_are_sound() {
+        in_folder("points.json", CLICKS.as_bytes(), |folder| {
+            check_clicks(&folder.join("points.json"), &["a", "b"]).unwrap();
+        });
         in_folder(corrections::FILE, CORRECTIONS.as_bytes(), |folder| {
             let read = Corrections::read(folder, &["a".into(), "b".into()]).unwrap();
             assert_eq!(

@@ -31,4 +31,5 @@ pub mod sync;
 pub mod video;
 pub mod write;
 
+pub use clicks::check_clicks;
 pub use splat4d::{Error, ErrorKind, Result};

@@ -232,6 +232,13 @@ impl Output {
         self.ended(2)
     }
 
+    /// Standard output of a call that listed what it refuses the input for.
+    pub(crate) fn listed(self) -> String {
+        let listed = self.stdout.clone();
+        self.ended(2);
+        listed
+    }
+
     /// The one-paragraph error of a call that failed through no fault of its input.
     pub(crate) fn failed(self) -> String {
         self.ended(1)

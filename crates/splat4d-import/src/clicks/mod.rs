@@ -73,6 +73,11 @@ pub(crate) struct Length {
     pub metres: f64,
 }
 
+/// Reads a file of clicked points of cameras with these names. Errors: those of `import --points`.
+pub fn check_clicks(path: &Path, names: &[&str]) -> Result<()> {
+    Clicks::read(path, names).map(drop)
+}
+
 impl Clicks {
     /// The file of a path. Errors: unreadable, not this format, of another version, nonsense in it.
     pub(crate) fn read(path: &Path, names: &[&str]) -> Result<Self> {
