@@ -212,7 +212,7 @@ fn clicks_round_trip_and_nonsense_is_explained() {
         (json!([point("a")]), json!({"floor": ["b"]}), "refer to static points"),
         (json!([point("a")]), json!({"length": {"points": ["a", "a"], "metres": 1.0}}), "to itself"),
         (json!([point("a"), point("b")]), json!({"length": {"points": ["a", "b"], "metres": 0.0}}), "more than 0 m"),
-        (json!([point("a")]), json!({"flor": ["a"]}), "flor"),
+        (json!([point("a")]), json!({"ground": ["a"]}), "ground"),
         (json!([point("a")]), json!({"event": {"middle": 0.0}}), "no camera \"middle\""),
         (json!([point("a")]), json!({"cameras": {"left": [640, 480]}}), "image size of camera right"),
     ] {

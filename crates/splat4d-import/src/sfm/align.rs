@@ -20,7 +20,7 @@ pub(crate) fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
 
 /// The frame along which a scene is built.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Axes {
+pub(crate) struct Axes {
     /// Rows: x, y and, upwards, z of the frame in the world.
     pub rotation: Mat3,
     /// Whether floor and walls determine the up direction; else z is what cameras hold upwards.
@@ -55,7 +55,7 @@ const CLEAR: f64 = 0.15;
 ///
 /// (Entropy of projections as a measure of structure: Huber 1985, "Projection pursuit"; aligned with a room's axes in
 /// Coughlan and Yuille's "Manhattan world", 1999.)
-pub fn axes(points: &[[f64; 3]], up: [f64; 3], fixed: bool) -> Axes {
+pub(crate) fn axes(points: &[[f64; 3]], up: [f64; 3], fixed: bool) -> Axes {
     let level = about(up);
     let Some((points, bin)) = gathered(points) else {
         return Axes { rotation: level, upright: false, along: false };
