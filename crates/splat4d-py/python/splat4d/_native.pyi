@@ -353,6 +353,7 @@ def import_videos(
     camera_height: tuple[str, float] | None = None,
     calibration: _Path | None = None,
     colmap: bool = False,
+    points: _Path | None = None,
     masks: _Path | None = None,
     deinterlace: bool = False,
     png: bool = False,
