@@ -364,6 +364,13 @@ impl Work {
         corrected::apply(&mut capture, &run.path)?;
         let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture), run: &run.path };
         let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
+        let shown = before.as_ref().filter(|_| self.order.on.is_some()).and_then(|scores| scores.train("PSNR"));
+        if let Some(psnr) = shown.filter(|psnr| *psnr < UNLIKE) {
+            console.warn(&format!(
+                "training views of the scene have {psnr:.1} dB: its axes, unit or origin are probably not those of the capture. \
+                 `splat4d convert --up AXIS` turns a scene"
+            ));
+        }
         self.choose_size(&original, console)?;
         let (file, after) = loop {
             console.stop_polled(SAVING);
@@ -623,6 +630,9 @@ impl Original<'_> {
     }
 }
 
+/// PSNR of training views below which a scene shows something else than the capture, dB. One colour for a whole image has 10 to 15 dB; the
+/// bundled scene with its axes turned has 8.
+const UNLIKE: f64 = 15.0;
 /// Bytes of a file next to its Gaussians: a poster, cameras, a path.
 const BESIDES: u64 = 48 << 10;
 /// Margin below the size for another attempt.

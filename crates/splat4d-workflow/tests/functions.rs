@@ -166,7 +166,14 @@ fn a_scene_of_another_program_is_compressed_on_its_capture() {
         size: [32, 24],
         ..CompressOptions::default()
     };
-    compress(&scene, &options, &stop, &ignore).unwrap();
+    let warnings = RefCell::new(Vec::new());
+    let listen = |event: &Event<'_>| {
+        if let Event::Warning(text) = event {
+            warnings.borrow_mut().push(text.to_string());
+        }
+    };
+    compress(&scene, &options, &stop, &listen).unwrap();
+    assert!(warnings.borrow().iter().any(|w| w.contains("not those of the capture")), "{:?}", warnings.borrow());
     assert_eq!(Source::open(&at("small/original")).unwrap().scene.len(), GAUSSIANS);
     assert_eq!(Source::open(&at("small/scene.s4d")).unwrap().scene.len(), GAUSSIANS * 3 / 4);
     let read = |name: &str| -> serde_json::Value { serde_json::from_slice(&std::fs::read(at(name)).unwrap()).unwrap() };
