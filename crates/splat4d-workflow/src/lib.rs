@@ -37,7 +37,7 @@
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
 //! | `localising.rs` | pose and time of images |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
-//! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
+//! | `evaluating.rs`, `adopting.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; a scene of another program as a run; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
