@@ -8,6 +8,7 @@ use serde_json::json;
 use splat4d::Result;
 use splat4d::format;
 use splat4d::layers::Scene;
+use splat4d::math::sh::degree_of;
 use splat4d::scene::SH;
 use splat4d_train::path_text::to_text;
 use splat4d_train::recipe::Recipe;
@@ -16,8 +17,6 @@ use std::path::{Path, PathBuf};
 
 /// Models whose parameters a run tunes by their own rates. Of all others the Gaussians are tuned, and their motion stays.
 const TUNED: [&str; 2] = ["spacetime", "native4d"];
-/// Coefficients of spherical harmonics by degree, three channels each.
-const SH_COLUMNS: [usize; 4] = [3, 12, 27, 48];
 
 /// The capture that a scene of another program shows.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -91,5 +90,5 @@ fn motion(scene: &Scene<f32>) -> &'static str {
 /// The highest degree of spherical harmonics of its layers.
 fn sh_degree(scene: &Scene<f32>) -> usize {
     let width = scene.layers.iter().map(|layer| layer.params[SH].width()).max().unwrap_or(0);
-    SH_COLUMNS.iter().rposition(|columns| width >= *columns).unwrap_or(0)
+    degree_of(width / 3).unwrap_or(0)
 }

@@ -160,7 +160,6 @@ pub(crate) fn solve(cameras: &[Camera], points: &[Point]) -> Solution {
     let mut problem = Problem { cameras, points, clicks: Vec::new() };
     problem.set(&offsets);
     let mut rigs = problem.started();
-    rigs.truncate(RIGS);
     for rig in &mut rigs {
         problem.finish(rig);
     }

@@ -280,22 +280,17 @@ impl OpenCapture {
 
     pub(crate) fn trainer(&self, recipe: &Recipe, plan: &TrainContext, scene: Scene<f32>) -> Result<Trainer<'static>> {
         let program = recipe.program()?;
-        let mut trainer = self.trainer_of(recipe, plan, scene, stages(program.as_ref(), plan));
+        let mut trainer = self.trainer_of(plan, scene, stages(program.as_ref(), plan));
         trainer.replan(recipe.run.replans.rows());
+        trainer.train_state.corrections = self.corrections(recipe, plan);
         // What a still scene cannot show must not render it away from what it can.
         let strength = if program.capabilities(plan).moves { plan.common.loss.moving } else { 0.0 };
         trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)
     }
 
-    /// A trainer with stages that no program made.
-    pub(crate) fn trainer_of(
-        &self,
-        recipe: &Recipe,
-        plan: &TrainContext,
-        scene: Scene<f32>,
-        stages: Vec<Stage>,
-    ) -> Trainer<'static> {
+    /// A trainer with stages that no program made. Cameras stay where the capture has them.
+    pub(crate) fn trainer_of(&self, plan: &TrainContext, scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
         let c = &plan.common;
         let config = RenderConfig {
             antialias: if c.appearance.antialias { Antialias::On } else { Antialias::Off },
@@ -323,7 +318,6 @@ impl OpenCapture {
         let mut trainer = Trainer::new(scene, stages, self.frames.clone(), drawing.backend, loss, settings);
         trainer.device = TrainedOn { name: drawing.name, why: drawing.why, missed: drawing.fell_back };
         trainer.train_state.exposure = exposure;
-        trainer.train_state.corrections = self.corrections(recipe, plan);
         trainer
     }
 }

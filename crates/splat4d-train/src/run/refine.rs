@@ -97,10 +97,8 @@ pub(crate) fn refine(
         own_loss: false,
         stop,
     };
-    let mut trainer = opened.trainer_of(&recipe, &plan, job.scene, job.stages);
+    let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
     trainer.replan(recipe.run.replans.rows());
-    // Cameras stay where the capture has them: the scene was learnt there.
-    trainer.train_state.corrections = None;
     if job.exposure.is_some() {
         trainer.train_state.exposure = job.exposure;
     }
