@@ -2,12 +2,13 @@
 
 use crate::capture::{self, CAMERAS};
 use crate::scene::FRAMES;
-use crate::{long, still, videos, world};
+use crate::{long, still, videos, world, yard};
 use anyhow::{Context, Result, bail};
 use std::path::Path;
 
 /// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
-/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER [--size WxH] [--cameras N]`.
+/// `capture --world NAME FOLDER`, `capture --long SECONDS FOLDER [--size WxH] [--cameras N] [--scene hall|yard]` and
+/// `capture --photos VIEWS FOLDER [--size WxH]`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = capture::bundled_folder();
     match arguments {
@@ -30,11 +31,12 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
             capture::write(&home, Path::new(folder), true)
         }
         [flag, seconds, folder, options @ ..] if flag == "--long" => long::command(seconds, Path::new(folder), options),
+        [flag, views, folder, options @ ..] if flag == "--photos" => yard::command(views, Path::new(folder), options),
         [flag, folder] if flag == "--videos" => videos::command(Path::new(folder)),
         [] => capture::write(&home, &home, false),
         [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),
         _ => bail!(
-            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is needed, and a folder, or --long with seconds and a folder"
+            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is needed, and a folder, --long with seconds and a folder, or --photos with a number and a folder"
         ),
     }
 }

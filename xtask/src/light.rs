@@ -1,7 +1,7 @@
 //! Light: one key light with a soft shadow map, a fill light, sky and bounce light, and a glowing orb.
 
 use crate::mesh::Mesh;
-use crate::vector::{V3, v3};
+use crate::vector::{V3, smooth_step, v3};
 
 /// Towards the key light (not normalised).
 const KEY_DIRECTION: V3 = v3(-0.42, 1.0, 0.55);
@@ -13,6 +13,10 @@ const GROUND_COLOR: V3 = v3(0.30, 0.26, 0.21);
 const GLOW_COLOR: V3 = v3(0.10, 0.55, 0.60);
 /// The orb's light falls off as 1 / (1 + (distance / this)²)².
 const GLOW_REACH: f64 = 0.9;
+/// What glossy surfaces mirror above and below the horizon, and how much brighter than its light the key light's source is.
+const MIRRORED_SKY: V3 = v3(0.62, 0.72, 0.86);
+const MIRRORED_GROUND: V3 = v3(0.16, 0.14, 0.12);
+const HIGHLIGHT: f64 = 12.0;
 /// Texels of the shadow map in each direction.
 const SHADOW_SIZE: usize = 640;
 /// Half the side of the square the shadow map covers, scene units.
@@ -110,6 +114,21 @@ impl Light {
             sum += line * rim(j, fy);
         }
         sum / ((2 * n + 1) * (2 * n + 1)) as f64
+    }
+
+    /// What a glossy surface adds: the mirrored sky and ground, and the key light's highlight. `view`: unit, towards the
+    /// camera; `gloss`: the share mirrored head-on (Schlick 1994).
+    pub(crate) fn mirrored(&self, point: V3, normal: V3, view: V3, gloss: f64) -> V3 {
+        let facing = normal.dot(view).max(0.0);
+        let away = 1.0 - facing;
+        let share = gloss + (1.0 - gloss) * away * away * away * away * away;
+        let mirrored = normal * (2.0 * normal.dot(view)) - view;
+        let sky = MIRRORED_GROUND.lerp(MIRRORED_SKY, smooth_step(-0.15, 0.15, mirrored.y));
+        // cos³² of the angle to the light's mirror image.
+        let mut highlight = mirrored.dot(self.key).max(0.0);
+        (0..5).for_each(|_| highlight *= highlight);
+        let lit = if highlight > 1e-4 && normal.dot(self.key) > 0.0 { self.lit(point, normal) } else { 0.0 };
+        sky * share + KEY_COLOR * (HIGHLIGHT * share * highlight * lit)
     }
 
     /// Light that arrives at a matt surface with unit `normal`; `open` in `[0,1]` is how much of the sky it sees.

@@ -38,29 +38,32 @@ struct Wish {
     frames: usize,
     size: [usize; 2],
     cameras: usize,
+    yard: bool,
 }
 
 impl Wish {
-    /// `SECONDS FOLDER [--size WxH] [--cameras N]`, without the folder.
+    /// `SECONDS FOLDER [--size WxH] [--cameras N] [--scene hall|yard]`, without the folder.
     fn read(seconds: &str, options: &[String]) -> Result<Self> {
         let length: f64 = seconds.parse().with_context(|| format!("invalid seconds `{seconds}`"))?;
         ensure!(length * FPS >= 1.0 && length <= MAX_SECONDS, "give seconds from {:.3} to {MAX_SECONDS:.0}", 1.0 / FPS);
-        let mut wish = Self { frames: (length * FPS).round() as usize, size: [200, 150], cameras: capture::CAMERAS };
+        let mut wish =
+            Self { frames: (length * FPS).round() as usize, size: [200, 150], cameras: capture::CAMERAS, yard: false };
         let mut rest = options.iter();
         while let Some(option) = rest.next() {
             let value = rest.next().with_context(|| format!("{option} needs a value"))?;
             match option.as_str() {
-                "--size" => {
-                    let sides = value.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
-                    wish.size = sides.with_context(|| format!("invalid size `{value}`: give it as 1352x1014"))?;
-                }
+                "--size" => wish.size = size(value)?,
+                "--scene" => match value.as_str() {
+                    "hall" => wish.yard = false,
+                    "yard" => wish.yard = true,
+                    _ => bail!("there is no scene {value}: hall and yard are possible"),
+                },
                 "--cameras" => {
                     wish.cameras = value.parse().with_context(|| format!("invalid number of cameras `{value}`"))?;
                 }
-                _ => bail!("unknown option {option}: --size WxH and --cameras N are possible"),
+                _ => bail!("unknown option {option}: --size WxH, --cameras N and --scene NAME are possible"),
             }
         }
-        ensure!(wish.size.iter().all(|side| SIDES.contains(side)), "give sides of {SIDES:?} pixels");
         ensure!(CAMERAS.contains(&wish.cameras), "give {CAMERAS:?} cameras");
         Ok(wish)
     }
@@ -70,11 +73,20 @@ impl Wish {
     }
 }
 
-/// `--long SECONDS FOLDER [--size WxH] [--cameras N]`.
+/// The sides of `WxH`, pixels.
+pub(crate) fn size(text: &str) -> Result<[usize; 2]> {
+    let sides = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+    let sides = sides.with_context(|| format!("invalid size `{text}`: give it as 1352x1014"))?;
+    ensure!(sides.iter().all(|side| SIDES.contains(side)), "give sides of {SIDES:?} pixels");
+    Ok(sides)
+}
+
+/// `--long SECONDS FOLDER [--size WxH] [--cameras N] [--scene hall|yard]`.
 pub(crate) fn command(seconds: &str, folder: &Path, options: &[String]) -> Result<()> {
     let wish = Wish::read(seconds, options)?;
     let (frames, [width, height]) = (wish.frames, wish.size);
-    let stage = Stage::load(&bundled_folder().join("characters"))?;
+    let home = bundled_folder().join("characters");
+    let stage = if wish.yard { Stage::yard(&home)? } else { Stage::load(&home)? };
     let cameras = rig_of(wish.cameras, [width, height], FOCAL * width as f64);
     for t in 0..frames {
         let frame = at(&stage, t as f64 / FPS)?;
@@ -172,11 +184,11 @@ mod tests {
             assert!(command(bad, folder.path(), &[]).is_err(), "{bad}");
         }
         let options = |words: &str| words.split_whitespace().map(String::from).collect::<Vec<_>>();
-        let wish = Wish::read("2", &options("--size 1352x1014 --cameras 12")).unwrap();
-        assert_eq!(wish, Wish { frames: 60, size: [1352, 1014], cameras: 12 });
+        let wish = Wish::read("2", &options("--size 1352x1014 --cameras 12 --scene yard")).unwrap();
+        assert_eq!(wish, Wish { frames: 60, size: [1352, 1014], cameras: 12, yard: true });
         let held: Vec<usize> = (0..20).filter(|&c| wish.held_out(c)).collect();
         assert_eq!(held, HELD_OUT, "as in the bundled capture");
-        for bad in ["--size 12", "--size 4x4", "--cameras 2", "--cameras", "--fps 3"] {
+        for bad in ["--size 12", "--size 4x4", "--cameras 2", "--cameras", "--fps 3", "--scene moon"] {
             assert!(Wish::read("2", &options(bad)).is_err(), "{bad}");
         }
         for k in 0..400 {

@@ -31,6 +31,7 @@ mod truth;
 mod vector;
 mod videos;
 mod world;
+mod yard;
 
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;

@@ -7,6 +7,7 @@ use crate::raster::{Edges, NOTHING, SUPERSAMPLING, Visibility, corners, sample_r
 use crate::scene::{BACK, FRONT, Frame, SIDE};
 use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
+use crate::yard;
 
 /// A rendered image.
 pub(crate) struct Picture {
@@ -125,7 +126,12 @@ impl SampleShader<'_> {
         let color = material::albedo(triangle.material, uv, self.textures);
         let light = frame.light.arriving(point, normal, openness(frame, point, normal, triangle.object));
         let moving = f64::from(u8::from(triangle.object != 0));
-        (color.scaled_by(light) + material::glow(triangle.material), moving)
+        let mut color = color.scaled_by(light) + material::glow(triangle.material, uv);
+        let gloss = yard::gloss(triangle.material);
+        if gloss > 0.0 {
+            color = color + frame.light.mirrored(point, normal, (camera.position - point).unit(), gloss);
+        }
+        (color, moving)
     }
 }
 

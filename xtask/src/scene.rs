@@ -9,6 +9,7 @@ use crate::mesh::Mesh;
 use crate::skin::Character;
 use crate::texture::Texture;
 use crate::vector::{Affine, V3, heading, smooth_step, v3};
+use crate::yard;
 use anyhow::{Context, Result};
 use std::ops::Range;
 use std::path::Path;
@@ -65,13 +66,20 @@ pub(crate) struct Frame {
 impl Stage {
     /// Loads both characters from `folder`.
     pub(crate) fn load(folder: &Path) -> Result<Stage> {
+        Self::with_set(folder, hall(), props())
+    }
+
+    /// Both characters in the yard instead of the hall.
+    pub(crate) fn yard(folder: &Path) -> Result<Stage> {
+        Self::with_set(folder, yard::ground(), yard::props())
+    }
+
+    fn with_set(folder: &Path, mut fixed: Mesh, props: Mesh) -> Result<Stage> {
         let character = |name: &str| -> Result<Character> {
             let path = folder.join(name);
             let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
             Glb::parse(&bytes).and_then(|glb| Character::load(&glb)).with_context(|| path.display().to_string())
         };
-        let props = props();
-        let mut fixed = hall();
         fixed.append(&props);
         Ok(Stage { knight: character("Knight.glb")?, mage: character("Mage.glb")?, fixed, props })
     }
