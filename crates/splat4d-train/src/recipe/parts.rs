@@ -2,7 +2,7 @@
 
 use super::Recipe;
 use crate::init::{self, InitSettings};
-use crate::maintenance::{DENSE, FINEST, operations};
+use crate::maintenance::{DENSE, FINEST, LEAST, operations};
 use crate::methods::{CommonSettings, Method, TrainContext, filtered, methods, own};
 use crate::{Error, Result};
 use splat4d::motion::{BUILT_IN, MODELS};
@@ -55,7 +55,8 @@ impl Recipe {
 
     /// The number of initial Gaussians; without its largest number of Gaussians, the least that it becomes.
     pub(crate) fn initial_count(&self) -> usize {
-        if self.init.count == 0 { (self.crowd() * init::COUNT as f64) as usize } else { self.init.count }
+        let more = if self.crowd() > 1.0 { self.densify.max_cap - LEAST } else { 0 };
+        if self.init.count == 0 { init::COUNT + more / 2 } else { self.init.count }
     }
 
     /// The size above which a Gaussian is split, extents.
@@ -98,9 +99,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn static_scenes_of_many_gaussians_begin_with_a_third_of_them() {
+    fn static_scenes_begin_with_half_of_what_exceeds_the_least() {
         let of = |words: &[&str]| Recipe::of(words).unwrap().resolve().initial_count();
-        assert_eq!(of(&["motion=still", "max_cap=150000"]), 50_000);
+        assert_eq!(of(&["motion=still", "max_cap=150000"]), 70_000);
         assert_eq!(of(&["motion=still"]), init::COUNT, "small captures are tuned for as many");
         assert_eq!(of(&["motion=spacetime", "max_cap=150000"]), init::COUNT);
         assert_eq!(of(&["motion=still", "max_cap=150000", "init.count=700"]), 700);

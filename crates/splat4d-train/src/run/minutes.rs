@@ -54,8 +54,9 @@ impl Steps {
         let ([start, end], [few, many]) = (self.gaussians.map(|n| n as f64), self.seconds);
         let size = usize::from(place >= stage.half_size_steps);
         let slope = if end > start { (many[size] - few[size]) / (end - start) } else { 0.0 };
-        // A slope that noise turned over must not make steps free.
-        (few[size] + slope * (count - start)).max(0.5 * few[size].min(many[size]))
+        // A cloud that just grew can be faster than the initial one, whose Gaussians are large: more of them do not make
+        // steps cheaper beyond that.
+        few[size].min(many[size]).max(few[size] + slope * (count - start))
     }
 }
 
@@ -73,25 +74,32 @@ impl Timing {
         };
         tell(listen, 0);
         // A filter would be switched on later than the probes measure. The number of Gaussians may become smaller, and
-        // the initial one with it: the fewest are timed.
+        // the initial one with it: the fewest are timed, and those that the cap of this recipe brings.
         let least = recipe.clone().with(|r| r.densify.max_cap = 0).initial_count();
-        let recipe = recipe.unresolved().with(|r| (r.filter.start, r.init.count) = (0.0, least));
+        let with = |count: usize| recipe.unresolved().with(|r| (r.filter.start, r.init.count) = (0.0, count));
+        let (fewest, recipe) = (with(least), with(recipe.initial_count()));
         let plan = opened.plan(&recipe);
-        let began = clock.seconds();
-        let scene = opened.initial_scene(&recipe, &plan)?;
-        let first = clock.seconds() - began;
+        let mut first = 0.0;
+        let mut scene = |recipe: &Recipe| {
+            let began = clock.seconds();
+            let scene = opened.initial_scene(recipe, &plan);
+            first = clock.seconds() - began;
+            scene
+        };
+        let small = scene(&fewest)?;
+        let large = if fewest.init.count < recipe.init.count { scene(&recipe)? } else { small.clone() };
         // The scene is not made faster because steps are to be timed.
         let began = clock.seconds();
         let until = |part: f64| began + part * seconds;
-        let start = scene.len();
+        let start = small.len();
         // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
         // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it
         // is kept.
-        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene.clone())?, clock };
+        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, small)?, clock };
         probe.trainer.check_not_empty()?;
         let few = probe.rates(until(PARTS[0]))?;
         tell(listen, 1);
-        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene)?, clock };
+        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, large)?, clock };
         probe.densify(Every { first: HURRIED, last: usize::MAX, interval: HURRIED });
         probe.trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
         probe.trainer.stages[0].iterations = ENDLESS;
@@ -266,6 +274,23 @@ pub(super) mod tests {
         let (stated, chosen) = (cost("init.count=1000"), cost("init.count=0"));
         // Nothing grows in the first steps: ten milliseconds each, or, with 30,000 Gaussians, 39.
         assert!(stated < 10.0 && chosen > stated + 5.0 * 0.029, "{stated} {chosen}");
+    }
+
+    /// A few initial Gaussians are large, and those that they become after a few steps are faster: from the two alone, a
+    /// hundred thousand would cost nothing.
+    #[test]
+    fn both_numbers_of_initial_gaussians_are_timed_and_more_never_cost_less() {
+        use crate::run::tests::{Place, recipe};
+        let place = Place::new();
+        let r = recipe(&["motion=still", "densify.max_cap=90000", "init.count=0"]);
+        let opened = OpenCapture::new(place.open(&r), &r).unwrap();
+        let timing = Timing::measure(&opened, &r, &Stopwatch::start(), 0.1, &mut |_| {}).unwrap();
+        let [few, many] = timing.stages[0].gaussians;
+        let least = r.clone().with(|r| r.densify.max_cap = 0).initial_count();
+        assert!(few <= least && many > 2 * least, "{few}, {many} of {least} and {}", r.initial_count());
+        let turned = self::timing([9400, 14_000], [0.06, 0.18], [0.05, 0.10]);
+        let stages = [Stage::new("all", 100)];
+        assert_eq!([14_000, 226_000].map(|n| turned.step(&stages, 0, 0, n)), [0.10; 2]);
     }
 
     #[test]
