@@ -43,7 +43,7 @@ const PAGES: [Page; 4] = [
     },
 ];
 
-const AGAIN: &str = "UPDATE_GOLDEN=1 cargo test -p splat4d-cli --test cli_doc";
+const AGAIN: &str = "UPDATE_GOLDEN=1 cargo test -p splat4d --test cli_doc";
 
 fn text(page: &Page, all: &Command) -> String {
     let mut text = page.head.to_owned();
