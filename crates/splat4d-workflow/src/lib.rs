@@ -46,6 +46,7 @@
 //! | `aligning.rs` | points clicked in a page, for an import |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
+#![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
 #![allow(missing_docs)] // its interface is not stable yet
 
 pub mod adopting;
