@@ -51,6 +51,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "actions",
             "paths",
             "worlds",
+            "matrix",
             "smooth",
             "optimise",
             "ballistic",
