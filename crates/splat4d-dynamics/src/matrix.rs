@@ -7,7 +7,7 @@ use std::ops::{Index, IndexMut, Mul, Range, Sub};
 /// Sweeps of Jacobi rotations; convergence is quadratic, six or seven are usual.
 const SWEEPS: usize = 40;
 /// Entries off the diagonal, of the matrix's norm, that are taken for zero.
-const NEGLIGIBLE: f64 = 1e-15;
+const NEGLIGIBLE: f64 = 1e-13;
 
 /// A matrix, row-major.
 #[derive(Clone, Debug, PartialEq)]
@@ -53,6 +53,12 @@ impl Matrix {
         self
     }
 
+    /// Two rows, the first above the second.
+    fn two_rows(&mut self, p: usize, q: usize) -> (&mut [f64], &mut [f64]) {
+        let (above, below) = self.data.split_at_mut(q * self.width);
+        (&mut above[p * self.width..(p + 1) * self.width], &mut below[..self.width])
+    }
+
     /// Sum of products of entries.
     pub(crate) fn dot(&self, other: &Self) -> f64 {
         assert_eq!((self.height, self.width), (other.height, other.width), "matrices of one shape");
@@ -92,14 +98,17 @@ impl Matrix {
                 let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
                 let c = 1.0 / (t * t + 1.0).sqrt();
                 let s = t * c;
-                let turn = |x: f64, y: f64| (c * x - s * y, s * x + c * y);
+                let turn = |x: &mut f64, y: &mut f64| (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
+                let (first, second) = a.two_rows(p, q);
+                let [pp, qq] = [first[p] - t * off, second[q] + t * off];
+                first.iter_mut().zip(second.iter_mut()).for_each(|(x, y)| turn(x, y));
+                [first[p], first[q], second[p], second[q]] = [pp, 0.0, 0.0, qq];
+                // The columns are the rows again; rows are contiguous, which is several times faster.
                 for k in 0..n {
-                    (a[(k, p)], a[(k, q)]) = turn(a[(k, p)], a[(k, q)]);
+                    (a[(k, p)], a[(k, q)]) = (a[(p, k)], a[(q, k)]);
                 }
-                for k in 0..n {
-                    (a[(p, k)], a[(q, k)]) = turn(a[(p, k)], a[(q, k)]);
-                    (vectors[(p, k)], vectors[(q, k)]) = turn(vectors[(p, k)], vectors[(q, k)]);
-                }
+                let (first, second) = vectors.two_rows(p, q);
+                first.iter_mut().zip(second.iter_mut()).for_each(|(x, y)| turn(x, y));
             }
             if !turned {
                 break;
