@@ -13,6 +13,9 @@ mod surface;
 #[path = "tidy/words.rs"]
 mod words;
 
+#[path = "tidy/writers.rs"]
+mod writers;
+
 /// Files longer than `MAX_LINES`, each with its reason; none at present.
 const LONG_FILES: [(&str, &str); 0] = [];
 const MAX_LINES: usize = 800;
