@@ -126,6 +126,7 @@ enum Verb {
     Edit(verbs::edit::Args),
     Label(verbs::label::Args),
     Info(verbs::info::Args),
+    Recipe(verbs::recipe::Args),
     Completions(verbs::completions::Args),
 }
 
@@ -155,6 +156,7 @@ impl Verb {
             Verb::Edit(args) => verbs::edit::run(args, console),
             Verb::Label(args) => verbs::label::run(args, console),
             Verb::Info(args) => verbs::info::run(args, console),
+            Verb::Recipe(args) => verbs::recipe::run(args, console),
             Verb::Completions(args) => verbs::completions::run(args, console),
         }
     }

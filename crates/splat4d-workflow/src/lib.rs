@@ -49,6 +49,7 @@
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
+//! | `recipe_schema.rs` | a JSON Schema of recipes, for editors |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
 #![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
@@ -91,6 +92,7 @@ pub mod point_queries;
 pub mod predicting;
 pub mod programs;
 pub mod raw_values;
+pub mod recipe_schema;
 pub mod rendering;
 pub mod report;
 pub mod run_folder;

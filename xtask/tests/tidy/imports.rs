@@ -148,6 +148,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "picking",
             "editor",
             "aligning",
+            "recipe_schema",
             "texts",
         ],
     ),
