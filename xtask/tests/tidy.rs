@@ -51,7 +51,7 @@ const ROOTS: [&str; 7] = ["clients/", "crates/", "docs/", "examples/", "studies/
 const PENDING: [&str; 0] = [];
 
 /// Flags of other programs that documents show.
-const FOREIGN_FLAGS: [&str; 14] = [
+const FOREIGN_FLAGS: [&str; 18] = [
     "--release",
     "--workspace",
     "--all",
@@ -65,6 +65,10 @@ const FOREIGN_FLAGS: [&str; 14] = [
     "--strict",
     "--no-build-isolation",
     "--open",
+    "--format",
+    "--profile",
+    "--remap-path-prefix",
+    "--target-dir",
     "--prefix",
 ];
 
