@@ -14,7 +14,7 @@ import subprocess
 import sys
 
 # What the archives and the wheels link.
-PROGRAMS = ["splat4d-cli", "splat4d-py"]
+PROGRAMS = ["splat4d", "splat4d-py"]
 LICENCES = re.compile(r"^(licen[cs]e|copying|notice|unlicense|copyright)", re.IGNORECASE)
 ENTRY = re.compile(r"((?:-{1,2}|<|\[)\S.*?|[a-z]+)(?:\s{2,}(.*))?$")
 SHELLS = {"bash": "splat4d.bash", "zsh": "_splat4d", "fish": "splat4d.fish", "powershell": "splat4d.ps1", "elvish": "splat4d.elv"}

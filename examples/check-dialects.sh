@@ -15,7 +15,7 @@ trap 'rm -rf "$work"' EXIT
 
 ours="${SPLAT4D:-}"
 if [ -z "$ours" ]; then
-    cargo build --release --manifest-path "$here/../Cargo.toml" -p splat4d-cli
+    cargo build --release --manifest-path "$here/../Cargo.toml" -p splat4d
     target="$(cargo metadata --format-version 1 --no-deps --manifest-path "$here/../Cargo.toml" |
         node -e 'process.stdout.write(JSON.parse(require("fs").readFileSync(0)).target_directory)')"
     ours="$target/release/splat4d"

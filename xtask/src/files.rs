@@ -15,15 +15,9 @@ pub(crate) fn png(data: &[u8], width: usize, height: usize, color: ExtendedColor
     Ok(out)
 }
 
-/// Writes under a temporary name in the same folder, then renames; makes the folder if need be.
+/// Writes a file as a whole or not at all; makes the folder if need be.
 pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
-    let place = || path.display().to_string();
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder).with_context(place)?;
-    }
-    let temporary = path.with_extension("part");
-    std::fs::write(&temporary, bytes).with_context(place)?;
-    std::fs::rename(&temporary, path).with_context(place)
+    Ok(splat4d_train::output::write_atomically(path, bytes)?)
 }
 
 /// All files below a folder with their contents, by their paths in it.

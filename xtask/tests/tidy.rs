@@ -13,6 +13,9 @@ mod surface;
 #[path = "tidy/words.rs"]
 mod words;
 
+#[path = "tidy/writers.rs"]
+mod writers;
+
 /// Files longer than `MAX_LINES`, each with its reason; none at present.
 const LONG_FILES: [(&str, &str); 0] = [];
 const MAX_LINES: usize = 800;
@@ -48,7 +51,7 @@ const ROOTS: [&str; 7] = ["clients/", "crates/", "docs/", "examples/", "studies/
 const PENDING: [&str; 0] = [];
 
 /// Flags of other programs that documents show.
-const FOREIGN_FLAGS: [&str; 14] = [
+const FOREIGN_FLAGS: [&str; 18] = [
     "--release",
     "--workspace",
     "--all",
@@ -62,6 +65,10 @@ const FOREIGN_FLAGS: [&str; 14] = [
     "--strict",
     "--no-build-isolation",
     "--open",
+    "--format",
+    "--profile",
+    "--remap-path-prefix",
+    "--target-dir",
     "--prefix",
 ];
 
@@ -254,6 +261,53 @@ fn paths_in_documents_exist() {
         }
     }
     report(troubles, "Write the path as it is now, or take it out.");
+}
+
+/// Versions of a package in `Cargo.lock`.
+fn locked(lock: &str, name: &str) -> Vec<String> {
+    let head = format!("name = \"{name}\"\nversion = \"");
+    let versions = lock.split(head.as_str()).skip(1).filter_map(|rest| rest.split_once('"'));
+    versions.map(|(version, _)| version.to_owned()).collect()
+}
+
+/// Every dependency of a manifest in the workspace is a row of ARCHITECTURE.md, with a version that `Cargo.lock` has.
+#[test]
+fn dependencies_have_a_row_with_their_version() {
+    let (lock, page) = (read("Cargo.lock"), read("ARCHITECTURE.md"));
+    let (mut troubles, mut rows) = (Vec::new(), BTreeSet::new());
+    let section = page.split("\n## Dependencies\n").nth(1).expect("ARCHITECTURE.md has the section \"Dependencies\"");
+    for row in section.lines().filter(|l| l.starts_with("| `")) {
+        let mut cells = row.split(" | ");
+        let (names, stated) = (cells.next().unwrap_or(""), cells.next().unwrap_or(""));
+        // `0.30, MIT/Apache`, or a version for each name: `1.12, 0.1, 1.1, MIT`.
+        let stated: Vec<&str> =
+            stated.split(", ").take_while(|part| part.starts_with(|c: char| c.is_ascii_digit())).collect();
+        for (i, name) in names.split('`').skip(1).step_by(2).enumerate() {
+            let Some(version) = stated.get(i).or(stated.first()) else { continue };
+            rows.insert(name.to_owned());
+            let found = locked(&lock, name);
+            if !found.iter().any(|f| f == version || f.starts_with(&format!("{version}."))) {
+                troubles.push(format!("ARCHITECTURE.md: `{name}` {version}, and Cargo.lock has {found:?}"));
+            }
+        }
+    }
+    let others = ["studies/Cargo.toml", "xtask/Cargo.toml"].map(str::to_owned);
+    let manifests = files("crates", "toml").into_iter().chain(others);
+    for path in manifests.filter(|p| p.ends_with("/Cargo.toml") && !p.contains("/fuzz/")) {
+        let text = read(&path);
+        let mut inside = false;
+        for line in text.lines() {
+            if line.starts_with('[') {
+                inside = line.trim_end().ends_with("dependencies]");
+            } else if inside && line.starts_with(|c: char| c.is_ascii_lowercase()) {
+                let name = line.split(['.', ' ', '=']).next().unwrap_or("");
+                if !name.starts_with("splat4d") && !rows.contains(name) {
+                    troubles.push(format!("{path}: ARCHITECTURE.md has no row of `{name}`"));
+                }
+            }
+        }
+    }
+    report(troubles, "State the version of Cargo.lock, and the reason of a new dependency.");
 }
 
 #[test]

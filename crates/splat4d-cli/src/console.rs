@@ -1,8 +1,8 @@
 //! Output during work: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines. Results go to
 //! stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
 
+use crate::bar::Bar;
 use crate::interrupt;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
@@ -34,8 +34,6 @@ const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 const JSON_INTERVAL: Duration = Duration::from_secs(1);
 /// A shorter phase shows no time left.
 const LEAST_PACE: Duration = Duration::from_secs(3);
-/// Redraws of a bar a second: frequent enough for a terminal, cheap over slow remote shells.
-const BAR_RATE: u8 = 8;
 
 /// The one place that prints.
 #[derive(Debug)]
@@ -57,7 +55,7 @@ struct Pace {
 #[derive(Debug, Default)]
 struct State {
     pace: Option<Pace>,
-    bar: Option<ProgressBar>,
+    bar: Option<Bar>,
     phase: String,
     last_line: Option<Instant>,
     /// The first iteration after a pause gets a plain line of its own.
@@ -340,18 +338,15 @@ impl Console {
         let mut state = self.state.borrow_mut();
         let fresh = state.phase != name;
         if fresh {
-            if let Some(bar) = state.bar.take() {
-                bar.finish_and_clear();
+            if let Some(mut bar) = state.bar.take() {
+                bar.erase();
             }
             state.phase = name.to_owned();
             state.said_progress = false;
         }
         if self.terminal {
-            let bar = state.bar.get_or_insert_with(|| bar(total));
-            bar.set_length(total.max(done).max(1) as u64);
-            bar.set_position(done as u64);
-            bar.set_prefix(text::in_line(name).into_owned());
-            bar.set_message(text::in_line(words).into_owned());
+            let bar = state.bar.get_or_insert_default();
+            bar.show(&text::in_line(name), done, total, &text::in_line(words));
             return;
         }
         let due = state.last_line.is_none_or(|t| t.elapsed() >= PLAIN_INTERVAL);
@@ -367,16 +362,20 @@ impl Console {
     /// Ends the bar.
     pub fn clear(&self) {
         let mut state = self.state.borrow_mut();
-        if let Some(bar) = state.bar.take() {
-            bar.finish_and_clear();
+        if let Some(mut bar) = state.bar.take() {
+            bar.erase();
         }
         state.phase.clear();
     }
 
     fn above_bar(&self, f: impl FnOnce()) {
-        let bar = self.state.borrow().bar.clone();
+        // Taken out while `f` runs: it may print by this console.
+        let bar = self.state.borrow_mut().bar.take();
         match bar {
-            Some(bar) => bar.suspend(f),
+            Some(mut bar) => {
+                bar.suspend(f);
+                self.state.borrow_mut().bar = Some(bar);
+            }
             None => f(),
         }
     }
@@ -384,13 +383,6 @@ impl Console {
 
 fn time_left(elapsed: Duration, done: usize, left: usize) -> Option<f64> {
     (elapsed >= LEAST_PACE && done > 0 && left > 0).then(|| elapsed.as_secs_f64() * left as f64 / done as f64)
-}
-
-fn bar(total: usize) -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stderr_with_hz(BAR_RATE));
-    let style = ProgressStyle::with_template("{prefix} {bar:28} {pos}/{len}  {msg}").expect("the template is fixed");
-    bar.set_style(style.progress_chars("█▉▊▋▌▍▎▏ "));
-    bar
 }
 
 /// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are

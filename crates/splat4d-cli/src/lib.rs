@@ -10,13 +10,14 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `interrupt.rs`, `console.rs` | Ctrl-C; output |
+//! | `interrupt.rs`, `bar.rs`, `console.rs` | Ctrl-C; a progress bar; output |
 //! | `device.rs`, `measuring.rs`, `serving.rs` | options of several commands: device, evaluation, the player's server |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
 
 #![allow(missing_docs)] // internal to the workspace
 
+mod bar;
 pub mod console;
 mod device;
 pub mod interrupt;
@@ -27,6 +28,8 @@ pub mod verbs;
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
 use splat4d::Error;
+#[cfg(not(all(feature = "dynamics", feature = "import")))]
+use splat4d_workflow::parts::left_out;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -100,13 +103,19 @@ pub struct Globals {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    #[cfg(feature = "import")]
     Import(verbs::import::Args),
+    #[cfg(not(feature = "import"))]
+    Import(verbs::left_out::Args),
     Train(Box<verbs::train::Args>),
     Join(verbs::join::Args),
     Status(verbs::status::Args),
     Eval(verbs::eval::Args),
     Compare(verbs::compare::Args),
+    #[cfg(feature = "dynamics")]
     Predict(verbs::predict::Args),
+    #[cfg(not(feature = "dynamics"))]
+    Predict(verbs::left_out::Args),
     Render(verbs::render::Args),
     Localise(verbs::localise::Args),
     Bake(verbs::bake::Args),
@@ -117,19 +126,26 @@ enum Verb {
     Edit(verbs::edit::Args),
     Label(verbs::label::Args),
     Info(verbs::info::Args),
+    Recipe(verbs::recipe::Args),
     Completions(verbs::completions::Args),
 }
 
 impl Verb {
     fn run(&self, console: &Console) -> anyhow::Result<()> {
         match self {
+            #[cfg(feature = "import")]
             Verb::Import(args) => verbs::import::run(args, console),
+            #[cfg(not(feature = "import"))]
+            Verb::Import(_) => Err(left_out("`import`", "import").into()),
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Join(args) => verbs::join::run(args, console),
             Verb::Status(args) => verbs::status::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
             Verb::Compare(args) => verbs::compare::run(args, console),
+            #[cfg(feature = "dynamics")]
             Verb::Predict(args) => verbs::predict::run(args, console),
+            #[cfg(not(feature = "dynamics"))]
+            Verb::Predict(_) => Err(left_out("`predict`", "dynamics").into()),
             Verb::Render(args) => verbs::render::run(args, console),
             Verb::Localise(args) => verbs::localise::run(args, console),
             Verb::Bake(args) => verbs::bake::run(args, console),
@@ -140,6 +156,7 @@ impl Verb {
             Verb::Edit(args) => verbs::edit::run(args, console),
             Verb::Label(args) => verbs::label::run(args, console),
             Verb::Info(args) => verbs::info::run(args, console),
+            Verb::Recipe(args) => verbs::recipe::run(args, console),
             Verb::Completions(args) => verbs::completions::run(args, console),
         }
     }

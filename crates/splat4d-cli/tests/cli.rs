@@ -30,6 +30,7 @@ use splat4d::format::playback::{Index, Kind};
 use splat4d::format::ply;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
+use splat4d_train::recipe::{MotionName, Recipe};
 use std::path::{Path, PathBuf};
 
 /// Options of a run that takes a second.
@@ -70,6 +71,7 @@ fn help_has_examples_and_completions_complete() {
         "convert",
         "label",
         "info",
+        "recipe",
         "completions",
     ] {
         assert!(help.contains(verb), "{verb} is missing");
@@ -95,6 +97,29 @@ fn help_has_examples_and_completions_complete() {
     let second = |arg: &str| std::process::Command::new(env!("CARGO_BIN_EXE_s4d")).arg(arg).output().unwrap();
     assert_eq!(String::from_utf8(second("--version").stdout).unwrap(), version);
     assert_eq!(second("--nothing").status.code(), Some(2));
+}
+
+#[test]
+fn the_schema_of_events_lists_those_of_the_page() {
+    let schema = sample::event_schema();
+    let page = include_str!("../../../docs/events.md");
+    for name in schema["$defs"].as_object().unwrap().keys() {
+        assert!(page.contains(&format!("`{name}`")), "docs/events.md lacks {name}");
+    }
+    let (lists, _) = page.split_once("## Other commands").expect("the page has this part");
+    for name in lists.lines().filter_map(|l| l.strip_prefix("| `")?.split('`').next()).filter(|name| *name != "type") {
+        assert!(schema["$defs"].get(name).is_some(), "docs/events.schema.json lacks {name}");
+    }
+}
+
+#[test]
+fn a_recipe_is_printed_with_its_schema() {
+    let recipe = splat4d(&["recipe"]).run().ok();
+    let read = Recipe::from_toml(&format!("#:schema ./recipe.schema.json\n{recipe}")).unwrap();
+    assert_eq!(read, Recipe::default().with(|r| r.run.motion = MotionName::AUTO));
+    let schema: Value = serde_json::from_str(&splat4d(&["recipe", "--schema"]).run().ok()).unwrap();
+    assert_eq!(schema["properties"]["run"]["properties"]["iterations"]["type"], "integer");
+    assert_eq!(schema["properties"]["iterations"]["deprecated"], true, "older names are valid");
 }
 
 #[test]

@@ -19,7 +19,7 @@ const PAGES: [Page; 4] = [
                | this page | import, info, train, join, status |\n\
                | [results](cli-results.md) | eval, compare, render, predict, localise |\n\
                | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
-               | [conversion and edits](cli-edits.md) | convert, edit, label, completions |\n\n\
+               | [conversion and edits](cli-edits.md) | convert, edit, label, recipe, completions |\n\n\
                Every command also accepts these options:\n",
         commands: &["import", "info", "train", "join", "status"],
     },
@@ -37,13 +37,13 @@ const PAGES: [Page; 4] = [
     },
     Page {
         file: "cli-edits.md",
-        head: "# Command line: conversion and edits\n\nOptions of `convert`, `edit`, `label` and `completions`. Options that \
-               every command accepts: [captures and training](cli.md).\n",
-        commands: &["convert", "edit", "label", "completions"],
+        head: "# Command line: conversion and edits\n\nOptions of `convert`, `edit`, `label`, `recipe` and `completions`. \
+               Options that every command accepts: [captures and training](cli.md).\n",
+        commands: &["convert", "edit", "label", "recipe", "completions"],
     },
 ];
 
-const AGAIN: &str = "UPDATE_GOLDEN=1 cargo test -p splat4d-cli --test cli_doc";
+const AGAIN: &str = "UPDATE_GOLDEN=1 cargo test -p splat4d --test cli_doc";
 
 fn text(page: &Page, all: &Command) -> String {
     let mut text = page.head.to_owned();

@@ -11,8 +11,9 @@
 //! paths is not. How many pairs there are is chosen by forecasts from several ticks of the past. The residual of the
 //! last tick decays as earlier residuals did.
 
+use crate::matrix::{Matrix, solve};
 use crate::paths::{Moment, Paths, Pose, nearest};
-use nalgebra::{DMatrix, DVector};
+use splat4d::math::cholesky::Cholesky;
 use splat4d::math::mat3::procrustes;
 use splat4d::math::median;
 use splat4d::math::quat;
@@ -93,17 +94,19 @@ impl Koopman {
     pub(crate) fn rollout(&self, paths: &Paths, horizon: usize) -> Vec<Moment> {
         let (y, ticks) = (numbers(paths), paths.len());
         let basis = columns(&self.pairs, ticks + horizon);
-        let amounts = Projection::new(basis.rows(0, ticks).into_owned()).amounts(&y);
-        let rest = y - basis.rows(0, ticks) * &amounts;
-        let (before, after) = (rest.rows(0, ticks - 1), rest.rows(1, ticks - 1));
+        let seen = basis.rows(0..ticks);
+        let amounts = Projection::new(seen.clone()).amounts(&y);
+        let rest = &y - &(&seen * &amounts);
+        let (before, after) = (rest.rows(0..ticks - 1), rest.rows(1..ticks));
         // The rest is taken for an autoregression of the first order, one for all.
         let fading = (before.dot(&after) / before.norm_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-        let later = basis.rows(ticks, horizon) * &amounts;
+        let later = &basis.rows(ticks..ticks + horizon) * &amounts;
         let length = reach(paths);
         (0..horizon)
             .map(|h| {
-                let y = later.row(h) + fading.powi(h as i32 + 1) * rest.row(ticks - 1);
-                (0..paths.nodes()).map(|k| pose(y.as_slice(), k, length)).collect()
+                let share = fading.powi(h as i32 + 1);
+                let y: Vec<f64> = later.row(h).iter().zip(rest.row(ticks - 1)).map(|(l, r)| l + share * r).collect();
+                (0..paths.nodes()).map(|k| pose(&y, k, length)).collect()
             })
             .collect()
     }
@@ -115,8 +118,8 @@ fn most_pairs(ticks: usize) -> usize {
 }
 
 /// \[ticks, 1 + 2 pairs]: ones, and a fading cosine and sine of each pair.
-fn columns(pairs: &[Pair], ticks: usize) -> DMatrix<f64> {
-    DMatrix::from_fn(ticks, 1 + 2 * pairs.len(), |t, c| {
+fn columns(pairs: &[Pair], ticks: usize) -> Matrix {
+    Matrix::from_fn(ticks, 1 + 2 * pairs.len(), |t, c| {
         let Some(i) = c.checked_sub(1) else { return 1.0 };
         let (pair, t) = (pairs[i / 2], t as f64);
         let phase = pair.turn * t;
@@ -126,34 +129,34 @@ fn columns(pairs: &[Pair], ticks: usize) -> DMatrix<f64> {
 
 /// Least squares on columns.
 struct Projection {
-    a: DMatrix<f64>,
-    gram: nalgebra::Cholesky<f64, nalgebra::Dyn>,
+    a: Matrix,
+    gram: Cholesky,
 }
 
 impl Projection {
-    fn new(a: DMatrix<f64>) -> Self {
-        let mut gram = a.transpose() * &a;
+    fn new(a: Matrix) -> Self {
+        let mut gram = &a.transpose() * &a;
         // Sines of nothing are nothing: of the mean square, not of their own.
-        let ridge = RIDGE * gram.trace() / gram.nrows() as f64;
-        (0..gram.nrows()).for_each(|i| gram[(i, i)] += ridge);
+        let ridge = RIDGE * gram.trace() / gram.height() as f64;
+        (0..gram.height()).for_each(|i| gram[(i, i)] += ridge);
         let gram = gram.cholesky().expect("a Gram matrix with a ridge is positive");
         Self { a, gram }
     }
 
     /// Coefficients of each column for each column of y.
-    fn amounts(&self, y: &DMatrix<f64>) -> DMatrix<f64> {
-        self.gram.solve(&(self.a.transpose() * y))
+    fn amounts(&self, y: &Matrix) -> Matrix {
+        solve(&self.gram, &(&self.a.transpose() * y))
     }
 
     /// Residual of y after the columns.
-    fn rest(&self, y: &DMatrix<f64>) -> DMatrix<f64> {
-        y - &self.a * self.amounts(y)
+    fn rest(&self, y: &Matrix) -> Matrix {
+        y - &(&self.a * &self.amounts(y))
     }
 }
 
 /// The pairs and one more, all fitted to `y` \[ticks, components].
-fn grown(pairs: &[Pair], y: &DMatrix<f64>) -> Vec<Pair> {
-    let ticks = y.nrows();
+fn grown(pairs: &[Pair], y: &Matrix) -> Vec<Pair> {
+    let ticks = y.height();
     let unit = std::f64::consts::TAU / (FINENESS * ticks) as f64;
     let tries = ((std::f64::consts::TAU / SHORTEST) / unit) as usize;
     let with = |i: usize| [pairs, &[Pair { root: DECAY, turn: i as f64 * unit }]].concat();
@@ -163,21 +166,21 @@ fn grown(pairs: &[Pair], y: &DMatrix<f64>) -> Vec<Pair> {
 }
 
 /// Levenberg and Marquardt over roots and turns.
-fn fitted(mut pairs: Vec<Pair>, y: &DMatrix<f64>) -> Vec<Pair> {
-    let ticks = y.nrows();
+fn fitted(mut pairs: Vec<Pair>, y: &Matrix) -> Vec<Pair> {
+    let ticks = y.height();
     let mut damping = DAMPING;
     let mut projection = Projection::new(columns(&pairs, ticks));
     let mut rest = projection.rest(y);
     for _ in 0..STEPS {
         let jacobian = jacobian(&pairs, &projection, y);
         let n = jacobian.len();
-        let normal = DMatrix::from_fn(n, n, |i, j| jacobian[i].dot(&jacobian[j]));
-        let slope = DVector::from_fn(n, |i, _| jacobian[i].dot(&rest));
+        let normal = Matrix::from_fn(n, n, |i, j| jacobian[i].dot(&jacobian[j]));
+        let slope: Vec<f64> = jacobian.iter().map(|of| of.dot(&rest)).collect();
         let before = rest.norm_squared();
         let after = loop {
             let mut damped = normal.clone();
             (0..n).for_each(|i| damped[(i, i)] += damping * normal[(i, i)].max(f64::MIN_POSITIVE));
-            let step = damped.cholesky().map(|c| c.solve(&slope));
+            let step = damped.cholesky().map(|c| c.solve(slope.clone()));
             if let Some(step) = step.filter(|s| s.iter().all(|x| x.is_finite())) {
                 let moved =
                     |(i, p): (usize, &Pair)| Pair { root: p.root - step[2 * i], turn: p.turn - step[2 * i + 1] };
@@ -203,31 +206,31 @@ fn fitted(mut pairs: Vec<Pair>, y: &DMatrix<f64>) -> Vec<Pair> {
 }
 
 /// Derivatives of the rest with respect to each root and turn (Kaufman: −P⊥ (∂A/∂p) B).
-fn jacobian(pairs: &[Pair], projection: &Projection, y: &DMatrix<f64>) -> Vec<DMatrix<f64>> {
+fn jacobian(pairs: &[Pair], projection: &Projection, y: &Matrix) -> Vec<Matrix> {
     let amounts = projection.amounts(y);
     let of = |i: usize, which: usize| {
         let (c, s) = (1 + 2 * i, 2 + 2 * i);
-        let (cos, sin) = (projection.a.column(c), projection.a.column(s));
-        let changed = DMatrix::from_fn(y.nrows(), y.ncols(), |t, k| {
+        let changed = Matrix::from_fn(y.height(), y.width(), |t, k| {
             let (bc, bs) = (amounts[(c, k)], amounts[(s, k)]);
-            let slope =
-                if which == 0 { -2.0 * pairs[i].root * (cos[t] * bc + sin[t] * bs) } else { cos[t] * bs - sin[t] * bc };
+            let (cos, sin) = (projection.a[(t, c)], projection.a[(t, s)]);
+            let slope = if which == 0 { -2.0 * pairs[i].root * (cos * bc + sin * bs) } else { cos * bs - sin * bc };
             t as f64 * slope
         });
-        -projection.rest(&changed)
+        projection.rest(&changed).scaled(-1.0)
     };
     (0..pairs.len()).flat_map(|i| [of(i, 0), of(i, 1)]).collect()
 }
 
 /// Principal components of the numbers about their mean, \[ticks, components].
-fn components(y: &DMatrix<f64>) -> DMatrix<f64> {
-    let mean = y.row_mean();
-    let centred = DMatrix::from_fn(y.nrows(), y.ncols(), |t, c| y[(t, c)] - mean[c]);
+fn components(y: &Matrix) -> Matrix {
+    let ticks = y.height();
+    let mean: Vec<f64> = (0..y.width()).map(|c| (0..ticks).map(|t| y[(t, c)]).sum::<f64>() / ticks as f64).collect();
+    let centred = Matrix::from_fn(ticks, y.width(), |t, c| y[(t, c)] - mean[c]);
     // Of the Gram matrix of the ticks: an eigenvector times its singular value is a component.
-    let eigen = (&centred * centred.transpose()).symmetric_eigen();
-    let mut order: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
-    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
-    let values: Vec<f64> = order.iter().map(|&i| eigen.eigenvalues[i].max(0.0)).collect();
+    let (eigenvalues, eigenvectors) = (&centred * &centred.transpose()).symmetric_eigen();
+    let mut order: Vec<usize> = (0..ticks).collect();
+    order.sort_by(|&a, &b| eigenvalues[b].total_cmp(&eigenvalues[a]));
+    let values: Vec<f64> = order.iter().map(|&i| eigenvalues[i].max(0.0)).collect();
     let total: f64 = values.iter().sum();
     let mut kept = 0.0;
     let needed = values.iter().take_while(|v| {
@@ -236,7 +239,7 @@ fn components(y: &DMatrix<f64>) -> DMatrix<f64> {
         more
     });
     let count = needed.count().clamp(1, COMPONENTS.min(order.len()));
-    DMatrix::from_fn(y.nrows(), count, |t, c| eigen.eigenvectors[(t, order[c])] * values[c].sqrt())
+    Matrix::from_fn(ticks, count, |t, c| eigenvectors[(order[c], t)] * values[c].sqrt())
 }
 
 /// How far a turn of a node reaches: the mean distance of nodes from their neighbours, scene units; of a single node,
@@ -253,9 +256,9 @@ fn reach(paths: &Paths) -> f64 {
 const WIDTH: usize = 12;
 
 /// \[ticks, 12 nodes]: positions, and rotations (rows) times their reach.
-fn numbers(paths: &Paths) -> DMatrix<f64> {
+fn numbers(paths: &Paths) -> Matrix {
     let length = reach(paths);
-    DMatrix::from_fn(paths.len(), WIDTH * paths.nodes(), |t, c| {
+    Matrix::from_fn(paths.len(), WIDTH * paths.nodes(), |t, c| {
         let p = &paths.moments[t][c / WIDTH];
         match (c % WIDTH).checked_sub(3) {
             None => p.x[c % WIDTH],
@@ -345,7 +348,7 @@ mod tests {
         let truth = [Pair { root: 0.1, turn: 0.3 }, Pair { root: 0.2, turn: 0.8 }];
         let basis = columns(&truth, 40);
         let y =
-            &basis * DMatrix::from_fn(5, 3, |r, c| (1 + r + 2 * c) as f64 * if (r + c) % 2 == 0 { 1.0 } else { -0.7 });
+            &basis * &Matrix::from_fn(5, 3, |r, c| (1 + r + 2 * c) as f64 * if (r + c) % 2 == 0 { 1.0 } else { -0.7 });
         let rest = |pairs: &[Pair]| Projection::new(columns(pairs, 40)).rest(&y);
         let found = jacobian(&truth, &Projection::new(basis), &y);
         for (j, found) in found.iter().enumerate() {
@@ -359,13 +362,9 @@ mod tests {
                 }
                 rest(&pairs)
             };
-            let numeric = (moved(h) - moved(-h)) / (2.0 * h);
-            assert!(
-                (&numeric - found).norm() < 1e-5 * numeric.norm(),
-                "{j}: {} of {}",
-                (&numeric - found).norm(),
-                numeric.norm()
-            );
+            let numeric = (&moved(h) - &moved(-h)).scaled(1.0 / (2.0 * h));
+            let (off, size) = ((&numeric - found).norm_squared().sqrt(), numeric.norm_squared().sqrt());
+            assert!(off < 1e-5 * size, "{j}: {off} of {size}");
         }
     }
 }

@@ -16,6 +16,7 @@
 //! |---|---|
 //! | `actions.rs`, `paths.rs` | actions, a row of named numbers per frame; poses of nodes at even ticks |
 //! | `worlds.rs` | worlds with known physics, for tests and `xtask capture --world` |
+//! | `matrix.rs` | dense matrices: products, equations, eigenvectors |
 //! | `smooth.rs`, `optimise.rs` | smoothing splines by generalised cross-validation; Adam for the networks |
 //! | `ballistic.rs`, `koopman.rs` | baselines that learn nothing; optimised dynamic mode decomposition, stable by construction |
 //! | `learnt.rs` | the contract of a network that predicts accelerations, its training over whole rollouts, its forecasts |
@@ -34,6 +35,7 @@ pub mod future;
 pub mod graph;
 mod koopman;
 pub mod learnt;
+mod matrix;
 pub mod models;
 pub mod nodes;
 mod optimise;

@@ -5,8 +5,8 @@
 //! the velocity at the last observed time is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978)
 //! over all nodes together. Ticks after the last observed one are not read.
 
+use crate::matrix::{Matrix, solve};
 use crate::paths::{Moment, Paths};
-use nalgebra::DMatrix;
 use splat4d::math::quat;
 
 /// Order of the differences.
@@ -20,8 +20,8 @@ pub(crate) fn smooth(paths: &Paths) -> Paths {
     if ticks <= ORDER + 1 || nodes == 0 {
         return paths.clone();
     }
-    let places = DMatrix::from_fn(ticks, 3 * nodes, |t, c| paths.moments[t][c / 3].x[c % 3]);
-    let turns = DMatrix::from_fn(ticks, 4 * nodes, |t, c| aligned(paths, t, c / 4)[c % 4]);
+    let places = Matrix::from_fn(ticks, 3 * nodes, |t, c| paths.moments[t][c / 3].x[c % 3]);
+    let turns = Matrix::from_fn(ticks, 4 * nodes, |t, c| aligned(paths, t, c / 4)[c % 4]);
     let (places, turns) = (smoothed(&places), smoothed(&turns));
     let moment = |t: usize| -> Moment {
         let node = |k: usize| crate::paths::Pose {
@@ -46,19 +46,19 @@ fn aligned(paths: &Paths, t: usize, k: usize) -> [f64; 4] {
 }
 
 /// Every column smoothed with one strength.
-fn smoothed(y: &DMatrix<f64>) -> DMatrix<f64> {
-    let n = y.nrows();
-    let mut differences = DMatrix::zeros(n - ORDER, n);
-    for r in 0..n - ORDER {
-        [-1.0, 3.0, -3.0, 1.0].iter().enumerate().for_each(|(i, c)| differences[(r, r + i)] = *c);
-    }
-    let penalty = differences.transpose() * &differences;
-    let mut best: Option<(f64, DMatrix<f64>)> = None;
+fn smoothed(y: &Matrix) -> Matrix {
+    let n = y.height();
+    let third = [-1.0, 3.0, -3.0, 1.0];
+    let differences =
+        Matrix::from_fn(n - ORDER, n, |r, c| c.checked_sub(r).and_then(|i| third.get(i)).copied().unwrap_or(0.0));
+    let penalty = &differences.transpose() * &differences;
+    let mut best: Option<(f64, Matrix)> = None;
     for power in STRENGTHS {
         let lambda = 10f64.powf(0.5 * f64::from(power));
-        let Some(cholesky) = (DMatrix::identity(n, n) + lambda * &penalty).cholesky() else { continue };
-        let z = cholesky.solve(y);
-        let free = n as f64 - cholesky.inverse().trace();
+        let system = Matrix::from_fn(n, n, |i, j| f64::from(u8::from(i == j)) + lambda * penalty[(i, j)]);
+        let Some(factor) = system.cholesky() else { continue };
+        let z = solve(&factor, y);
+        let free = n as f64 - solve(&factor, &Matrix::identity(n)).trace();
         let score = (y - &z).norm_squared() / (free * free);
         if best.as_ref().is_none_or(|(s, _)| score < *s) {
             best = Some((score, z));

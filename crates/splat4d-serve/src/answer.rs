@@ -2,8 +2,9 @@
 
 use crate::assets::{self, ASSIST, Asset, INDEX};
 use crate::body::Body;
-use crate::edit::{self, Editing};
+use crate::edit;
 use crate::events::Hub;
+use crate::given::Editing;
 use crate::guard::Guard;
 use crate::photos::{self, Photos};
 use crate::range::{self, Requested};

@@ -5,6 +5,7 @@
 //! and our own origin. The program decides what to do with it; it may return another scene.
 
 use crate::body::Body;
+use crate::given::{EditResponse, Editing};
 use crate::reply::{text, whole};
 use crate::scene::Scene;
 use crate::write_timeout::{Either, either};
@@ -14,12 +15,10 @@ use hyper::http::request::Parts;
 use hyper::{Response, StatusCode};
 use serde_json::{Value, json};
 use splat4d::{Error, Result};
-use std::fmt;
 use std::future::poll_fn;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::oneshot;
 
 /// Route of edits.
 pub(crate) const ROUTE: &str = "/edit";
@@ -33,44 +32,7 @@ const TOKEN: &str = "x-splat4d-token";
 const MAX_BODY: usize = 1 << 20;
 /// A body must be complete in this time.
 const BODY_TIME: Duration = Duration::from_secs(10);
-/// Queries that are worked on at a time: a slow one, and one that only reads.
-const AT_ONCE: usize = 2;
-/// Least length of a token: shorter ones could be guessed.
-const LEAST_TOKEN: usize = 16;
-
-/// A program's response to a page that edits.
-#[derive(Clone, Debug, Default)]
-pub struct EditResponse {
-    /// Sent to the page.
-    pub result: Value,
-    /// The scene from now on, a `.s4d`; `result` gets its number as `version`.
-    pub scene: Option<Arc<[u8]>>,
-}
-
-/// Does what a page requests.
-type Handler = dyn Fn(Value) -> Result<EditResponse> + Send + Sync;
-
-/// Permission for pages with a token to request edits from a program.
-#[derive(Clone)]
-pub struct Editing {
-    token: String,
-    answer: Arc<Handler>,
-    places: Arc<Semaphore>,
-}
-
-impl fmt::Debug for Editing {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Editing")
-    }
-}
-
 impl Editing {
-    /// `answer` is called on a thread of its own, on two at a time. Panics: a token that could be guessed.
-    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditResponse> + Send + Sync + 'static) -> Self {
-        assert!(token.len() >= LEAST_TOKEN && token.bytes().all(|b| b.is_ascii_alphanumeric()), "a token is random");
-        Self { token, answer: Arc::new(answer), places: Arc::new(Semaphore::new(AT_ONCE)) }
-    }
-
     /// Why a request may not edit. Host and origins that were sent are checked already.
     fn refuses(&self, request: &Parts) -> Option<(StatusCode, &'static str)> {
         let mut tokens = request.headers.get_all(TOKEN).iter();

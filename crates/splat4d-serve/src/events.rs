@@ -5,6 +5,7 @@
 //! from the same log.
 
 use crate::body::Body;
+use crate::given::News;
 use crate::write_timeout::{Either, either};
 use hyper::body::Bytes;
 use serde_json::{Value, json};
@@ -28,21 +29,6 @@ const HEARTBEAT: Duration = Duration::from_secs(15);
 const RETRY: u32 = 1000;
 /// In place of the newest number: there will be no more.
 const CLOSED: u64 = u64::MAX;
-
-/// An event. On the wire: the object's fields and `kind`.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub enum News {
-    /// `kind: "step"`: training continued: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
-    /// `seconds_left`, `stage`.
-    Step(Value),
-    /// `kind: "note"`: an event to be sent: `message`.
-    Note(Value),
-    /// `kind: "control"`: the run was paused, continued or stopped: `state`.
-    Control(Value),
-    /// `kind: "done"`: the run is over; the server continues serving.
-    Done(Value),
-}
 
 #[derive(Clone, Debug)]
 struct Entry {

@@ -35,37 +35,55 @@
 //!
 //! | module | content |
 //! |---|---|
+//! | `photos.rs`, `given.rs` | images of the capture's cameras; what a program gives: scene, news, permissions, settings |
 //! | `write_timeout.rs`, `body.rs`, `range.rs`, `reply.rs` | timeouts, request bodies, byte ranges, responses |
 //! | `guard.rs` | who may send requests |
 //! | `scene.rs` | the served scene: a file by range, or bytes that a live run replaces |
 //! | `edit.rs` | the one guarded request that accepts input: edits, with a token |
 //! | `assets.rs`, `page.rs` | the player's files; player and scene as one static page |
 //! | `events.rs` | events of a live run: one bounded log |
-//! | `photos.rs` | images of the capture's cameras |
 //! | `answer.rs`, `server.rs` | routes and headers; start, stop, accept: one thread, bounded memory |
+//! | `no_server.rs` | in place of the server without the feature `server` |
 //! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete; the others hold the last frame |
 
+#![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
+#![cfg_attr(not(feature = "server"), allow(dead_code))] // without the server nothing asks for the page's files
+
+#[cfg(feature = "server")]
 mod answer;
 mod assets;
+#[cfg(feature = "server")]
 mod body;
+#[cfg(feature = "server")]
 mod edit;
+#[cfg(feature = "server")]
 mod events;
+mod given;
+#[cfg(feature = "server")]
 mod guard;
+#[cfg(not(feature = "server"))]
+mod no_server;
 mod page;
 mod photos;
+#[cfg(feature = "server")]
 mod range;
+#[cfg(feature = "server")]
 mod reply;
+#[cfg(feature = "server")]
 mod scene;
+#[cfg(feature = "server")]
 mod server;
+#[cfg(feature = "server")]
 mod write_timeout;
 
 pub use assets::{Asset, asset, assets};
-pub use edit::{EditResponse, Editing};
-pub use events::News;
+pub use given::{Config, Content, DEFAULT_PORT, EditResponse, Editing, News};
+#[cfg(not(feature = "server"))]
+pub use no_server::{Running, Server};
 pub use page::{Page, SceneIn};
 pub use photos::{Photo, PhotoQuery, Photos};
-pub use scene::Content;
-pub use server::{Config, DEFAULT_PORT, Running, Server};
+#[cfg(feature = "server")]
+pub use server::{Running, Server};
 
-#[cfg(test)]
+#[cfg(all(test, feature = "server"))]
 mod tests;

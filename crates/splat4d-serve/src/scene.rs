@@ -1,11 +1,11 @@
 //! The served scene: a file on disk, or bytes in memory that may be replaced.
 
 use crate::body::Body;
+use crate::given::Content;
 use hyper::body::Bytes;
 use splat4d::{Error, Result};
 use std::fs::{File, Metadata};
 use std::io;
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::UNIX_EPOCH;
 
@@ -14,20 +14,6 @@ use std::time::UNIX_EPOCH;
 const CHUNK: u64 = 128 << 10;
 /// Live versions kept: the newest, and the one that a page may still be reading.
 const VERSIONS: usize = 2;
-
-/// Scene that the server shows.
-#[derive(Clone, Debug, Default)]
-#[non_exhaustive]
-pub enum Content {
-    /// No scene yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
-    #[default]
-    Nothing,
-    /// A `.s4d` file, read by range and never as a whole. It is opened once: a file that takes its place later is
-    /// not mixed into it.
-    File(PathBuf),
-    /// The bytes of one.
-    Bytes(Arc<[u8]>),
-}
 
 /// One state of the scene. Cheap to clone.
 #[derive(Clone, Debug)]

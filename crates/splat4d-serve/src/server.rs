@@ -2,22 +2,18 @@
 //! use.
 
 use crate::answer::{Shared, answer};
-use crate::edit::Editing;
-use crate::events::News;
+use crate::given::{Config, DEFAULT_PORT, News};
 use crate::guard::Guard;
-use crate::photos::Photos;
-use crate::scene::{Content, Scene};
-use crate::write_timeout::{Either, WriteTimeout, either};
+use crate::scene::Scene;
+use crate::write_timeout::{Clock, Either, WriteTimeout, either};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
-use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::Value;
 use splat4d::{Error, Result};
 use std::convert::Infallible;
 use std::future::{Future, poll_fn};
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs};
-use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::Arc;
 use std::task::Poll;
@@ -27,8 +23,6 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::runtime::Runtime;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
-/// The default port.
-pub const DEFAULT_PORT: u16 = 4440;
 /// Ports tried behind the default one where it is taken.
 const NEXT_PORTS: u16 = 20;
 /// Connections served at a time. Those beyond wait in the system's queue, where they cost the program nothing: a
@@ -51,54 +45,6 @@ const NO_ROOM: Duration = Duration::from_millis(100);
 /// How much the server's thread steps back for training (19 is most): a page still loads at once, training never waits.
 #[cfg(target_os = "linux")]
 const NICE: i32 = 10;
-
-/// Settings of the server: what to serve, and where.
-#[derive(Clone, Debug)]
-pub struct Config {
-    /// A name or address of this machine to listen on. Anything but loopback lets others in.
-    pub host: String,
-    /// The port; 0 means any free one; None means [`DEFAULT_PORT`] or, where it is taken, a free one after it.
-    pub port: Option<u16>,
-    /// The scene.
-    pub content: Content,
-    /// Instead of `content`: the page shows the scene at this http(s) address, whose server must allow it (CORS).
-    pub foreign: Option<String>,
-    /// An object that `/config.json` passes on to the page, such as `{"title": "knight"}`.
-    pub about: Value,
-    /// Whether news will be published: the page then listens.
-    pub live: bool,
-    /// Permission for pages to edit; none: nothing can be sent.
-    pub editing: Option<Editing>,
-    /// Permission for pages to pause and stop a live run, by the same rules.
-    pub control: Option<Editing>,
-    /// Permission for the page of manual alignment to send points, by the same rules; `/` is then that page.
-    pub assist: Option<Editing>,
-    /// Images of the capture's cameras.
-    pub photos: Option<Photos>,
-    /// Whether to step back for other work of this machine (Linux only).
-    pub background: bool,
-    /// Reads the player from this folder, at every request, instead of the embedded one, for its development.
-    pub player_folder: Option<PathBuf>,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self {
-            host: "127.0.0.1".into(),
-            port: None,
-            content: Content::Nothing,
-            foreign: None,
-            about: Value::Null,
-            live: false,
-            editing: None,
-            control: None,
-            assist: None,
-            photos: None,
-            background: false,
-            player_folder: None,
-        }
-    }
-}
 
 /// Makes [`Running`] servers.
 #[derive(Debug)]
@@ -312,11 +258,11 @@ async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermi
     });
     let mut connection = pin!(
         http1::Builder::new()
-            .timer(TokioTimer::new())
+            .timer(Clock)
             .header_read_timeout(HEAD_TIME)
             .max_buf_size(MAX_HEAD)
             .max_headers(MAX_HEADERS)
-            .serve_connection(TokioIo::new(WriteTimeout::new(stream)), service)
+            .serve_connection(WriteTimeout::new(stream), service)
     );
     let mut stop = pin!(stopped.changed());
     let mut stopping = false;

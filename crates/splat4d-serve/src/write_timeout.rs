@@ -1,6 +1,7 @@
 //! A connection that is closed if the client stops reading. The HTTP library limits the time of a request's head, but
 //! not of a client that requests much and then reads nothing.
 
+use hyper::rt::{Read, ReadBufCursor, Write};
 use std::future::{Future, poll_fn};
 use std::io;
 use std::pin::{Pin, pin};
@@ -14,6 +15,8 @@ use tokio::time::{Instant, Sleep};
 const WINDOW: Duration = Duration::from_secs(20);
 /// 3 kB a second: a tenth of the slowest line on which a scene is watchable.
 const LEAST: usize = 64 << 10;
+/// Bytes that are read at once. Requests are heads of at most 16 KiB and small lists of edits.
+const BLOCK: usize = 8 << 10;
 
 /// A stream that fails where its reader stalls.
 #[derive(Debug)]
@@ -77,13 +80,16 @@ pub(crate) async fn either<A: Future, B: Future>(a: A, b: B) -> Either<A::Output
     .await
 }
 
-impl AsyncRead for WriteTimeout {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(cx, buf)
+impl Read for WriteTimeout {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, mut out: ReadBufCursor<'_>) -> Poll<io::Result<()>> {
+        let mut block = [0; BLOCK];
+        let room = out.remaining().min(BLOCK);
+        let mut bytes = ReadBuf::new(&mut block[..room]);
+        Pin::new(&mut self.stream).poll_read(cx, &mut bytes).map_ok(|()| out.put_slice(bytes.filled()))
     }
 }
 
-impl AsyncWrite for WriteTimeout {
+impl Write for WriteTimeout {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write(cx, buf);
         self.judge(cx, written)
@@ -111,10 +117,35 @@ impl AsyncWrite for WriteTimeout {
     }
 }
 
+/// The clock by which the HTTP library limits the time of a request's head.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Clock;
+
+struct Wait(Pin<Box<Sleep>>);
+
+impl hyper::rt::Timer for Clock {
+    fn sleep(&self, duration: Duration) -> Pin<Box<dyn hyper::rt::Sleep>> {
+        Box::pin(Wait(Box::pin(tokio::time::sleep(duration))))
+    }
+
+    fn sleep_until(&self, deadline: std::time::Instant) -> Pin<Box<dyn hyper::rt::Sleep>> {
+        Box::pin(Wait(Box::pin(tokio::time::sleep_until(deadline.into()))))
+    }
+}
+
+impl Future for Wait {
+    type Output = ();
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        self.0.as_mut().poll(cx)
+    }
+}
+
+impl hyper::rt::Sleep for Wait {}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::io::Read;
 
     #[test]
     fn a_client_that_reads_nothing_is_disconnected() {
@@ -136,7 +167,7 @@ mod tests {
             assert_eq!(error.kind(), io::ErrorKind::TimedOut);
             drop(timed);
             let mut got = Vec::new();
-            client.read_to_end(&mut got).unwrap();
+            io::Read::read_to_end(&mut client, &mut got).unwrap();
             assert_eq!(got.len(), sent);
         });
     }

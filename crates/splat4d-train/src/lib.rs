@@ -52,6 +52,8 @@
 //! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of tracks and flow, alignment of held-out cameras, trajectory errors, localisation, floaters, `results.json` and `per_view.json` |
 //! | `compress/`, `compress/quantise/` | settings, rounds of pruning, settings for a size; fine-tuning through the file's quantisation (straight-through) |
 
+#![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
+
 mod blended;
 pub mod capture;
 pub mod compress;

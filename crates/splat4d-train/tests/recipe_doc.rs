@@ -79,7 +79,9 @@ iterations = 3000
 max_cap = 60000
 ```
 
-- `splat4d train --help-knobs [TOPIC]` prints these tables.
+- `splat4d train --help-knobs [TOPIC]` prints these tables, `splat4d recipe` a file with all settings.
+- `splat4d recipe --schema > recipe.schema.json` writes a JSON Schema. Editors with Taplo (Even Better TOML) complete and check a
+  recipe next to it whose first line is `#:schema ./recipe.schema.json`.
 - The effective settings are stored with every run as `recipe.toml`. Training again from that file repeats the run.
 - Older names without a table, in the last column, also work (`--set max_cap=60000`, or `max_cap = 60000` at the top of the file).
 - A setting without effect (`mcmc.growth` if `densify.strategy` is adc) is refused by `--set` and reported as a warning

@@ -13,8 +13,8 @@ use splat4d::format::playback::Provenance;
 use splat4d::layers::Scene;
 use splat4d::scene::{Camera, Planes, Time};
 use splat4d::{Error, Result};
-use splat4d_dynamics::nodes::follow_among;
-use splat4d_dynamics::paths::Pose;
+#[cfg(feature = "dynamics")]
+use splat4d_dynamics::{nodes::follow_among, paths::Pose};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::floaters::support;
@@ -276,6 +276,12 @@ impl Context for Bring<'_> {
         Ok(selected)
     }
 
+    #[cfg(not(feature = "dynamics"))]
+    fn follow(&self, _: &Scene<f32>, _: &Selected, _: &[[f64; 3]], _: &[f64], _: usize) -> Result<Vec<Vec<[f64; 3]>>> {
+        Err(crate::parts::left_out("following what moves", "dynamics"))
+    }
+
+    #[cfg(feature = "dynamics")]
     fn follow(
         &self,
         scene: &Scene<f32>,

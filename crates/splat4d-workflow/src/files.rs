@@ -4,20 +4,16 @@ use splat4d::format::playback::{EXTENSION, OLD_EXTENSION};
 use splat4d::{Error, Result};
 pub use splat4d_train::files::{open, read, read_text};
 use splat4d_train::output::Staged;
-use std::io::Write;
 use std::path::Path;
 
 /// Remedy when a file cannot be written.
 pub const WRITE_REMEDY: &str = "Check that the folder exists, that you may write there and that the disk is not full.";
 
-/// Writes a file: to a temporary name in the same folder, then renamed. Devices and pipes are written directly.
+/// Writes a file by [`Staged`]. Devices and pipes are written directly.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let out = Staged::new(path)?;
     let fail = |e| cannot_write(path, e);
-    let mut file = std::fs::File::create(out.path()).map_err(fail)?;
-    file.write_all(bytes).map_err(fail)?;
-    file.flush().map_err(fail)?;
-    drop(file);
+    std::fs::write(out.path(), bytes).map_err(fail)?;
     out.keep()
 }
 

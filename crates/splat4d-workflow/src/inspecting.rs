@@ -1,5 +1,6 @@
 //! The work behind `info`: what a capture, a run or a file contains, and whether it looks healthy.
 
+#[cfg(feature = "import")]
 mod doctor;
 mod playback;
 
@@ -19,6 +20,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
 use splat4d::{Error, Result};
+#[cfg(feature = "import")]
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, CaptureKind, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
@@ -124,6 +126,9 @@ pub fn inspect(path: &Path, options: &InspectOptions, console: &dyn Listener) ->
             .at(path.display())
             .remedy("Give a capture's folder, or leave option `doctor` out."));
     }
+    if options.doctor.is_some() && !cfg!(feature = "import") {
+        return Err(crate::parts::left_out("the doctor", "import"));
+    }
     if Run::is(path) {
         of_run(path)
     } else if is_capture {
@@ -140,6 +145,7 @@ fn line(out: &mut String, name: &str, value: &str) {
 
 fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> Result<Inspection> {
     let recipe = &options.recipe;
+    #[cfg(feature = "import")]
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
@@ -156,6 +162,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
         check_apart(folder, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
         // Before the images are read, which takes a while.
         files::make_folder(folder)?;
+        #[cfg(feature = "import")]
         return doctor::of(&capture, folder, console);
     }
     let (first, last) = capture.time_range();
@@ -258,6 +265,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
 }
 
 /// A capture that is shipped as a video per camera with poses, whose frames are not extracted yet.
+#[cfg(feature = "import")]
 fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
     let name = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let name = name.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned());
@@ -301,6 +309,7 @@ fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
 }
 
 /// The first and the last name of a list, and those between where there are few.
+#[cfg(feature = "import")]
 fn in_short(names: &[&str]) -> String {
     /// Names that are listed.
     const LISTED: usize = 6;

@@ -17,13 +17,18 @@
 //! # }
 //! ```
 //!
+//! # Features
+//!
+//! `gpu` adds the GPU renderer. `dynamics` (forecasts), `import` (captures from videos, the doctor) and `serve` (the
+//! player's server) are on by default; without one its functions are missing, or return an error that names it.
+//!
 //! # Code map
 //!
 //! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
 //!
 //! | module | content |
 //! |---|---|
-//! | `events.rs` | what workflows report, and listeners |
+//! | `events.rs`, `parts.rs` | what workflows report, and listeners; parts that a small build leaves out |
 //! | `files.rs`, `deadline.rs` | files and numbers in words; the time that is left of `--minutes` |
 //! | `camera_file.rs`, `paths/` | camera files; orbits, data-set cameras and key-framed camera paths |
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
@@ -44,11 +49,14 @@
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
+//! | `recipe_schema.rs` | a JSON Schema of recipes, for editors |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
+#![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
 #![allow(missing_docs)] // its interface is not stable yet
 
 pub mod adopting;
+#[cfg(feature = "import")]
 pub mod aligning;
 pub mod baking;
 pub mod camera_file;
@@ -69,18 +77,22 @@ pub mod exporting;
 pub mod files;
 pub mod foreign;
 pub mod growing;
+#[cfg(feature = "import")]
 pub mod importing;
 pub mod inspecting;
 pub mod labelling;
 pub mod localising;
 pub mod measure;
+pub mod parts;
 pub mod paths;
 mod picking;
 pub mod playable;
 pub mod point_queries;
+#[cfg(feature = "dynamics")]
 pub mod predicting;
 pub mod programs;
 pub mod raw_values;
+pub mod recipe_schema;
 pub mod rendering;
 pub mod report;
 pub mod run_folder;

@@ -12,9 +12,12 @@ use crate::run_folder::{self, Run, RunRequest, write_cameras};
 use serde_json::json;
 use splat4d::device::Device;
 use splat4d::{Error, ErrorKind, Result};
+#[cfg(feature = "import")]
 use splat4d_import::shipped;
 use splat4d_train::capture::{Capture, Lenses, Severity, Timing};
-use splat4d_train::event::{Event, Progress};
+use splat4d_train::event::Event;
+#[cfg(feature = "import")]
+use splat4d_train::event::Progress;
 use splat4d_train::output::{FolderContent, OutputFolder, Owner};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
@@ -407,7 +410,14 @@ impl<'a> Work<'a> {
     }
 }
 
+/// Without the importer a capture's frames must be there.
+#[cfg(not(feature = "import"))]
+fn extract(_: &Path, _: &AtomicBool, _: &dyn Listener) -> Result<()> {
+    Ok(())
+}
+
 /// Extracts the frames of a capture that is shipped as videos with poses.
+#[cfg(feature = "import")]
 fn extract(source: &Path, stop: &AtomicBool, listener: &dyn Listener) -> Result<()> {
     let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
     if shipped::videos(root).is_empty() {

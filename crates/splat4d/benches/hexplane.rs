@@ -1,5 +1,5 @@
 //! The `hexplane` model on 40,000 Gaussians (32 channels, 2 levels, networks 64 wide), its planes alone, and the same
-//! matrix products and as many bytes by themselves: `cargo bench -p splat4d --bench hexplane`.
+//! matrix products and as many bytes by themselves: `cargo bench -p splat4d-core --bench hexplane`.
 
 use divan::{Bencher, black_box};
 use splat4d::math::Rng;

@@ -1,5 +1,5 @@
 //! Networks on 50,000 rows, forward and backward, next to the speed of one large matrix product on as many threads:
-//! `cargo bench -p splat4d --bench nn`. Items are floating-point operations, of which a product of [m, k] and [k, n] has
+//! `cargo bench -p splat4d-core --bench nn`. Items are floating-point operations, of which a product of [m, k] and [k, n] has
 //! 2mkn: items a second of a network against those of `ceiling` is the share of the machine that it uses.
 
 use divan::Bencher;

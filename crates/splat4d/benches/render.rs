@@ -1,5 +1,5 @@
 //! The renderer's stages, one by one and together, on 30,000 synthetic Gaussians with spherical harmonics of degree 3
-//! at 400x400, on one and two threads: `cargo bench -p splat4d`. `studies bench` measures real scenes against the
+//! at 400x400, on one and two threads: `cargo bench -p splat4d-core`. `studies bench` measures real scenes against the
 //! roofline.
 
 use divan::{Bencher, black_box};

@@ -1,5 +1,5 @@
 //! Linear blend skinning of 100,000 Gaussians over 512 nodes, weights included, next to the bytes
-//! that skinning reads and writes: `cargo bench -p splat4d --bench skin`.
+//! that skinning reads and writes: `cargo bench -p splat4d-core --bench skin`.
 
 use divan::{Bencher, black_box};
 use splat4d::math::Rng;

@@ -1,6 +1,6 @@
 //! Drags the control nodes of a trained scene, as rigidly as possible, and renders it before and after into PPM images.
 //!
-//! `cargo run --release -p splat4d --example drag SCENE.safetensors BEFORE.ppm AFTER.ppm [SECONDS]`. The lower half of
+//! `cargo run --release -p splat4d-core --example drag SCENE.safetensors BEFORE.ppm AFTER.ppm [SECONDS]`. The lower half of
 //! the nodes is pinned, the topmost tenth moves sideways. Without arguments it drags a synthetic rod. The scene keeps
 //! its trained motion; only its nodes are displaced.
 

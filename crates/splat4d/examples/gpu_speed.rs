@@ -1,6 +1,6 @@
 //! Times the GPU renderer on random Gaussians with spherical harmonics of degree 3, at 1920x1080.
 //!
-//! `cargo run --release -p splat4d --features gpu --example gpu_speed [COUNT [WIDTHxHEIGHT [FRAMES]]]` prints the card,
+//! `cargo run --release -p splat4d-core --features gpu --example gpu_speed [COUNT [WIDTHxHEIGHT [FRAMES]]]` prints the card,
 //! milliseconds of every stage, frames per second of the GPU's work alone and from tables in memory to an image in
 //! memory, and the difference to the CPU's image. Works on software drivers too.
 

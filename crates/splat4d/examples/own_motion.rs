@@ -1,6 +1,6 @@
 //! A motion model of your own: Gaussians that sway, μ(t) = μ + a·sin(2πt/T), with a learnable amplitude a each.
 //!
-//! `cargo run --release -p splat4d --example own_motion [FOLDER]` checks its gradient, renders it at several times and, if a
+//! `cargo run --release -p splat4d-core --example own_motion [FOLDER]` checks its gradient, renders it at several times and, if a
 //! folder is given, writes the images there. Layers, the renderer, densification and training only call the trait, without
 //! knowing the model (`tests/own_motion.rs` of `splat4d-train` trains it, bakes it and plays the file).
 

@@ -1,6 +1,6 @@
 //! Packs a scene into a playback file, and prints its size and loss.
 //!
-//! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors
+//! `cargo run --release -p splat4d-core --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors
 //! whose layers move linearly, or a 3DGS .ply. Without one it packs 120,000 synthetic moving Gaussians with spherical
 //! harmonics of degree 3. Nothing is pruned: the figures are those of the format alone.
 

@@ -1,6 +1,6 @@
 //! Renders a 3DGS .ply or a scene.safetensors at one time into a PPM image.
 //!
-//! `cargo run --release -p splat4d --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it renders a small
+//! `cargo run --release -p splat4d-core --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it renders a small
 //! scene from memory.
 
 use splat4d::format;

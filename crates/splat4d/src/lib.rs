@@ -54,6 +54,8 @@
 //! | `play.rs`, `play/` | plays a scene or file on the CPU: active set, pages within a memory budget |
 //! | `edit/` | a list of steps: selections as text (`select.rs`), their evaluation over time (`look.rs`), effects on layers (`act.rs`), time windows and clocks (`clock.rs`), dragging (`drag.rs`) |
 
+#![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
+
 pub mod backward;
 pub mod bake;
 pub mod channels;

@@ -60,7 +60,7 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
     });
     let program = program
         .canonicalize()
-        .with_context(|| format!("{}: build it first with cargo build --release -p splat4d-cli", program.display()))?;
+        .with_context(|| format!("{}: build it first with cargo build --release -p splat4d", program.display()))?;
     let work = process::Scratch::new()?;
     let setup = Setup::new(Program(program), work.path())?;
     let mut bench = Bench { setup: &setup, work: work.path(), undisturbed: BTreeMap::new() };

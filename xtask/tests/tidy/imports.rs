@@ -51,6 +51,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "actions",
             "paths",
             "worlds",
+            "matrix",
             "smooth",
             "optimise",
             "ballistic",
@@ -84,6 +85,8 @@ const ORDER: [(&str, &[&str]); 9] = [
     (
         "crates/splat4d-serve",
         &[
+            "photos",
+            "given",
             "write_timeout",
             "body",
             "range",
@@ -94,15 +97,16 @@ const ORDER: [(&str, &[&str]); 9] = [
             "assets",
             "page",
             "events",
-            "photos",
             "answer",
             "server",
+            "no_server",
         ],
     ),
     (
         "crates/splat4d-workflow",
         &[
             "events",
+            "parts",
             "files",
             "deadline",
             "camera_file",
@@ -144,10 +148,11 @@ const ORDER: [(&str, &[&str]); 9] = [
             "picking",
             "editor",
             "aligning",
+            "recipe_schema",
             "texts",
         ],
     ),
-    ("crates/splat4d-cli", &["interrupt", "console", "device", "measuring", "serving", "verbs", "main", "bin"]),
+    ("crates/splat4d-cli", &["interrupt", "bar", "console", "device", "measuring", "serving", "verbs", "main", "bin"]),
     (
         "crates/splat4d-py",
         &[

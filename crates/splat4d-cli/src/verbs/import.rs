@@ -10,6 +10,7 @@ use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_workflow::aligning::Aligning;
 use splat4d_workflow::importing::import;
+use splat4d_workflow::parts::left_out;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -168,6 +169,9 @@ fn clicked(request: &Request, place: &Place, stop: &AtomicBool, console: &Consol
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    if args.assist && !cfg!(feature = "serve") {
+        return Err(left_out("--assist", "serve").into());
+    }
     let mut request = Request {
         inputs: args.videos.clone(),
         folder: args.output.clone(),

@@ -8,12 +8,17 @@ pub(crate) mod convert;
 pub(crate) mod edit;
 pub(crate) mod eval;
 pub(crate) mod export;
+#[cfg(feature = "import")]
 pub(crate) mod import;
 pub(crate) mod info;
 pub(crate) mod join;
 pub(crate) mod label;
+#[cfg(not(all(feature = "dynamics", feature = "import")))]
+pub(crate) mod left_out;
 pub(crate) mod localise;
+#[cfg(feature = "dynamics")]
 pub(crate) mod predict;
+pub(crate) mod recipe;
 pub(crate) mod render;
 pub(crate) mod status;
 pub mod train;

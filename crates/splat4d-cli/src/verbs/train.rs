@@ -12,6 +12,7 @@ use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::settings::{Setting, nearest};
 use splat4d_workflow::chunked::ChunkSelection;
 use splat4d_workflow::files::{self, parse_bytes};
+use splat4d_workflow::parts::left_out;
 use splat4d_workflow::training::{self, Finish, TrainingOptions};
 use std::path::PathBuf;
 
@@ -167,6 +168,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(topic) = &args.help_knobs {
         console.result(setting_list(topic)?.trim_end());
         return Ok(());
+    }
+    if args.view && !cfg!(feature = "serve") {
+        return Err(left_out("--view", "serve").into());
     }
     let stop = interrupt::flag(SAVING);
     let control = Control::new(stop.clone());

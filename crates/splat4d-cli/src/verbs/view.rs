@@ -12,6 +12,7 @@ use splat4d_train::run::open_capture;
 use splat4d_workflow::baking::{Baking, pack, title};
 use splat4d_workflow::capture_page;
 use splat4d_workflow::editor::{self, Editor};
+use splat4d_workflow::parts::left_out;
 use splat4d_workflow::playable::Playable;
 use splat4d_workflow::run_folder::Run;
 use splat4d_workflow::source::{Source, bundle, not_empty};
@@ -46,6 +47,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    if !cfg!(feature = "serve") {
+        return Err(left_out("`view`", "serve").into());
+    }
     let address = args.source.to_str().filter(|s| ["http://", "https://"].iter().any(|scheme| s.starts_with(scheme)));
     let mut token = None;
     let config = if let Some(file) = &args.edit {

@@ -199,12 +199,46 @@ impl Call {
         let mut command = Command::new(PROGRAM.expect("cargo builds the program"));
         command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         let output = command.args(&self.args).current_dir(folder).output().unwrap();
+        let stdout = String::from_utf8(output.stdout).unwrap();
+        if self.args.iter().any(|a| a == "--json") && option_env!("CARGO_BIN_EXE_splat4d").is_some() {
+            stdout.lines().filter(|l| l.starts_with('{')).for_each(check_event);
+        }
         Output {
             call: format!("{:?}", self.args),
             code: output.status.code(),
-            stdout: String::from_utf8(output.stdout).unwrap(),
+            stdout,
             stderr: String::from_utf8(output.stderr).unwrap(),
         }
+    }
+}
+
+/// The schema of the objects that `--json` prints.
+pub(crate) fn event_schema() -> Value {
+    serde_json::from_str(include_str!("../../../../docs/events.schema.json")).expect("the schema is JSON")
+}
+
+/// Whether a line of `--json` is an object of the schema, by the words that the schema uses.
+fn check_event(line: &str) {
+    let event: Value = serde_json::from_str(line).unwrap_or_else(|e| panic!("{e}: {line}"));
+    let (schema, name) = (event_schema(), event["type"].as_str().expect("every object has a type"));
+    let own = schema["$defs"].get(name).unwrap_or_else(|| panic!("docs/events.schema.json lacks {name}: {line}"));
+    let required =
+        |of: &Value| of["required"].as_array().unwrap().iter().all(|k| event.get(k.as_str().unwrap()).is_some());
+    assert!(required(&schema) && required(own), "a field is missing: {line}");
+    for (field, rule) in own["properties"].as_object().unwrap() {
+        let Some(value) = event.get(field) else { continue };
+        let is = |kind: &Value| match kind.as_str().expect("types are names") {
+            "string" => value.is_string(),
+            "integer" => value.is_u64() || value.is_i64(),
+            "number" => value.is_number(),
+            "boolean" => value.is_boolean(),
+            "array" => value.is_array(),
+            "object" => value.is_object(),
+            "null" => value.is_null(),
+            other => panic!("{other} is not used"),
+        };
+        let kinds = rule["type"].as_array().cloned().unwrap_or_else(|| vec![rule["type"].clone()]);
+        assert!(kinds.iter().any(is), "{field} is not {kinds:?}: {line}");
     }
 }
 

@@ -1,4 +1,5 @@
-//! Writes files so that no reader ever finds half of one: under a temporary name in the same folder, then renamed.
+//! Writes files so that no reader ever finds half of one, also after a power failure: under a temporary name in the same
+//! folder, flushed to the disk, then renamed. All files of the workspace are written here (`xtask/tests/tidy/writers.rs`).
 
 use super::owner::check_free;
 use super::temporary::{remove_leftovers_once, temporary_name};
@@ -50,9 +51,12 @@ impl Staged {
         self.temporary.as_deref().unwrap_or(&self.target)
     }
 
-    /// Gives the file its name. Errors: it cannot be renamed or listed.
+    /// Flushes the file to the disk and gives it its name. Errors: no space; it cannot be renamed or listed.
     pub fn keep(mut self) -> Result<()> {
         if let Some(temporary) = &self.temporary {
+            // A name must never be on the disk before the bytes.
+            let file = std::fs::OpenOptions::new().write(true).open(temporary);
+            file.and_then(|f| f.sync_all()).map_err(|e| cannot_write(&self.target, e))?;
             list::note(&self.target)?;
             std::fs::rename(temporary, &self.target).map_err(|e| cannot_write(&self.target, e))?;
             self.temporary = None;
@@ -94,9 +98,7 @@ pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) 
     let staged = Staged::at(path.to_owned(), path)?;
     let mut file = std::io::BufWriter::new(std::fs::File::create(staged.path()).map_err(failed)?);
     write(&mut file).map_err(|e| e.at(path.display()))?;
-    let file = file.into_inner().map_err(|e| failed(e.into_error()))?;
-    file.sync_all().map_err(failed)?;
-    drop(file);
+    drop(file.into_inner().map_err(|e| failed(e.into_error()))?);
     staged.keep()
 }
 

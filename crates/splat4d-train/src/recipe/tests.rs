@@ -61,6 +61,14 @@ fn tables_flat_names_and_assignments_are_equivalent() {
 }
 
 #[test]
+fn errors_of_syntax_name_the_line() {
+    for (text, line) in [("[run]\niterations = 1__0\n", 2), ("a = 1\n\n[run\n", 3), ("key", 1)] {
+        let error = Recipe::from_toml(text).unwrap_err().to_string();
+        assert!(error.contains(&format!("in line {line}: ")), "{error}");
+    }
+}
+
+#[test]
 fn assignments_accept_exponents_and_spaces() {
     let r = Recipe::of(&["position_lr_init=1", "max_cap=2e4", "motion = still"]).unwrap();
     assert_eq!((r.rates.position_init, r.densify.max_cap, r.run.motion.as_str()), (1.0, 20_000, "still"));

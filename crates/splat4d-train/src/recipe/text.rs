@@ -10,7 +10,9 @@ impl Recipe {
     /// wrong type or range.
     pub fn from_toml(text: &str) -> Result<Self> {
         let file: toml::Table = toml::from_str(text).map_err(|e| {
-            Error::input(format!("the recipe is not valid TOML: {}", e.message()))
+            let before = e.span().and_then(|span| text.as_bytes().get(..span.start)).unwrap_or_default();
+            let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
+            Error::input(format!("the recipe is not valid TOML in line {line}: {}", e.message()))
                 .remedy("Write lines such as `iterations = 3000`; `splat4d train --help-knobs` lists the settings")
         })?;
         let mut recipe = Self::default();

@@ -5,10 +5,13 @@
 pub mod chart;
 pub mod compare;
 pub mod compress;
+#[cfg(feature = "import")]
 pub mod doctor;
 mod pictures;
+#[cfg(feature = "dynamics")]
 pub mod predict;
 mod refined;
+#[cfg(feature = "import")]
 mod rig_map;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};

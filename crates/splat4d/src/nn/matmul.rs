@@ -1,7 +1,8 @@
-//! Matrix products on one thread, in f32 and f64: the only interface to `gemm`'s kernels, with every bound checked.
+//! Matrix products on one thread: the only interface to `gemm`'s kernels, with every bound checked.
 //!
-//! `gemm-f32` and `gemm-f64` are the two parts of `gemm` that are used: the crate of that name also builds its kernels
-//! for complex numbers and half floats, which is a third of a clean build of everything that is not ours.
+//! `gemm-f32` is the part of `gemm` that is used: the crate of that name also builds its kernels for complex numbers and
+//! half floats, which is a third of a clean build of everything that is not ours. Networks are in f64 only in tests,
+//! where plain sums are fast enough.
 #![allow(unsafe_code)] // the kernels take pointers; every matrix that reaches it was checked to be inside its slice
 
 use crate::math::Real;
@@ -50,40 +51,44 @@ pub fn product<F: Real>(a: Matrix<'_, F>, b: Matrix<'_, F>, out: &mut [F], strid
     // The kernels are fastest where columns of `out` are contiguous: out = a·b is then made as outᵀ = bᵀ·aᵀ.
     let (a, b, [row, column]) = if stride > 1 { (b.t(), a.t(), [1, stride]) } else { (a, b, [stride, 1]) };
     let distance = |n: usize| isize::try_from(n).expect("a slice is at most isize::MAX long");
-    macro_rules! run {
-        ($kernel:expr, $one:expr) => {
-            // SAFETY: `fits` has found all three matrices inside their slices; `out` is borrowed alone, so nothing
-            // overlaps; the pointers are of the type that they are cast to.
-            unsafe {
-                $kernel(
-                    a.rows,
-                    b.columns,
-                    a.columns,
-                    out.as_mut_ptr().cast(),
-                    distance(column),
-                    distance(row),
-                    add,
-                    a.data.as_ptr().cast(),
-                    distance(a.column),
-                    distance(a.row),
-                    b.data.as_ptr().cast(),
-                    distance(b.column),
-                    distance(b.row),
-                    $one,
-                    $one,
-                    false,
-                    false,
-                    false,
-                    Parallelism::None,
-                )
-            }
-        };
+    if TypeId::of::<F>() != TypeId::of::<f32>() {
+        return sums(a, b, out, [row, column], add);
     }
-    if TypeId::of::<F>() == TypeId::of::<f32>() {
-        run!(gemm_f32::gemm::f32::get_gemm_fn(), 1.0f32);
-    } else {
-        assert_eq!(TypeId::of::<F>(), TypeId::of::<f64>(), "matrix products are of f32 or f64");
-        run!(gemm_f64::gemm::f64::get_gemm_fn(), 1.0f64);
+    // SAFETY: `fits` has found all three matrices inside their slices; `out` is borrowed alone, so nothing overlaps; F is
+    // f32, the type that the pointers are cast to.
+    unsafe {
+        gemm_f32::gemm::f32::get_gemm_fn()(
+            a.rows,
+            b.columns,
+            a.columns,
+            out.as_mut_ptr().cast(),
+            distance(column),
+            distance(row),
+            add,
+            a.data.as_ptr().cast(),
+            distance(a.column),
+            distance(a.row),
+            b.data.as_ptr().cast(),
+            distance(b.column),
+            distance(b.row),
+            1.0,
+            1.0,
+            false,
+            false,
+            false,
+            Parallelism::None,
+        );
+    }
+}
+
+/// The product as its definition states it; element (i, j) is `out[i·row + j·column]`.
+fn sums<F: Real>(a: Matrix<'_, F>, b: Matrix<'_, F>, out: &mut [F], [row, column]: [usize; 2], add: bool) {
+    for i in 0..a.rows {
+        for j in 0..b.columns {
+            let terms = (0..a.columns).map(|l| a.data[i * a.row + l * a.column] * b.data[l * b.row + j * b.column]);
+            let (sum, to) = (terms.sum::<F>(), &mut out[i * row + j * column]);
+            *to = if add { *to + sum } else { sum };
+        }
     }
 }
 
