@@ -85,6 +85,7 @@ pub mod rendering;
 pub mod report;
 pub mod run_folder;
 pub mod sequence;
+mod sound;
 pub mod source;
 pub mod status;
 pub mod still_baseline;

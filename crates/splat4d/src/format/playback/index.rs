@@ -2,7 +2,7 @@
 
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, FIRST_VERSION, GROWING, HEADER_BYTES, MAGIC, MASKED, MAX_PAGE_GAUSSIANS,
-    MAX_PALETTE, Meta, PAGE_WORDS, VERSION,
+    MAX_PALETTE, Meta, PAGE_WORDS, VERSION, sound,
 };
 use crate::math::sh;
 use crate::scene::features::MOST_CHANNELS;
@@ -42,6 +42,8 @@ pub enum Kind {
     Poster,
     /// The file's provenance.
     Provenance,
+    /// What is heard.
+    Sound,
     /// Something newer, which is skipped.
     Other([u8; 4]),
 }
@@ -56,14 +58,15 @@ impl Kind {
             Kind::Features => *b"FEAT",
             Kind::Poster => *b"POST",
             Kind::Provenance => *b"PROV",
+            Kind::Sound => *b"SOUN",
             Kind::Other(tag) => tag,
         }
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        let known =
-            [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Features, Kind::Poster, Kind::Provenance];
-        known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
+        let of_pages = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Features];
+        let mut known = of_pages.into_iter().chain([Kind::Poster, Kind::Provenance, Kind::Sound]);
+        known.find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
     /// The four characters that the file has, others as dots.
@@ -116,7 +119,7 @@ pub struct Entry {
     pub degree: u16,
     /// Page: Gaussians. Palette: entries. Masks, labels, features: Gaussians of their page.
     pub count: u32,
-    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time.
+    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time. Sound: its first and last second.
     pub span: [f64; 2],
     /// Page: position of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
@@ -153,7 +156,7 @@ impl Index {
     /// [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
-    pub fn needed(prefix: &[u8]) -> Result<usize> {
+    pub(crate) fn needed(prefix: &[u8]) -> Result<usize> {
         if prefix.len() < HEADER_BYTES {
             let known = prefix.len().min(MAGIC.len());
             return if prefix[..known] == MAGIC[..known] { Ok(HEADER_BYTES) } else { Err(foreign()) };
@@ -532,6 +535,7 @@ impl Entry {
                     return Err(broken(format!("features of {count} Gaussians do not have {bytes} bytes")));
                 }
             }
+            Kind::Sound => sound::check(self)?,
             Kind::Poster | Kind::Provenance | Kind::Other(_) => {}
         }
         Ok(())
