@@ -256,7 +256,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
     not_empty(&source.scene, from)?;
     let read = if let SoundChoice::File(file) = &baking.sound { vec![file.as_path()] } else { Vec::new() };
     source.keep_all(from, &std::iter::once(out).chain(report).collect::<Vec<_>>(), &read)?;
-    sound::choose(&mut source, &baking.sound, out, listener)?;
+    source.sound = sound::chosen(source.sound.take(), &baking.sound, &source.scene, out, listener)?;
     if baking.options.repeat > 1 && source.sound.take().is_some() {
         listener.result("the sound is left out: option `repeat` repeats the clip, and would need it repeated");
     }
@@ -271,7 +271,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
 /// Bakes into the file `out` and states how well; returns the report. The options' cameras are the source's.
 pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, console: &dyn Listener) -> Result<Value> {
     let started = baking.deadline.now();
-    let baking = &Baking { bytes: sound::left(source, baking.bytes)?, ..baking.clone() };
+    let baking = &Baking { bytes: sound::left(source.sound.as_ref(), baking.bytes)?, ..baking.clone() };
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
     let Packed { mut bytes, baked, summary, antialias, .. } = packed;
     if source.provenance.is_some() || source.sound.is_some() {

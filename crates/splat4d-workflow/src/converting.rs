@@ -221,7 +221,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
         source.provenance = None;
     }
     if target != Target::Playback {
-        sound::dropped(&source, target.name(), console);
+        sound::dropped(source.sound.as_ref(), target.name(), console);
     }
     if let Some(degree) = args.sh {
         let had = source.scene.limit_sh(degree.into());

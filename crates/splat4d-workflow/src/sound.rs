@@ -3,9 +3,7 @@
 use crate::camera_file;
 use crate::events::Listener;
 use crate::files::{self, human_bytes};
-use crate::playable;
 use crate::run_folder::Run;
-use crate::source::Source;
 use splat4d::edit::Step;
 use splat4d::format::playback::{self, Sound};
 use splat4d::layers::Scene;
@@ -17,6 +15,8 @@ use std::path::{Path, PathBuf};
 
 /// Marker of captures that may name sound (docs/capture-format.md).
 const CAPTURE: &str = "capture.json";
+/// Name of a run's playback file.
+const PLAYBACK: &str = "scene.s4d";
 /// A cut that removes less than this is none, seconds.
 const NOTHING: f64 = 0.01;
 
@@ -49,7 +49,7 @@ pub(crate) fn of_capture(capture: &Path) -> Result<Option<Sound>> {
 
 /// The sound of a run: that of its capture or, where that is gone, of its playback file.
 pub(crate) fn of_run(run: &Run) -> Result<Option<Sound>> {
-    let file = playable::of_run(&run.path);
+    let file = run.path.join(PLAYBACK);
     match run.capture().filter(|capture| capture.exists()) {
         Some(capture) => of_capture(&capture),
         None if file.is_file() => playback::sound(&files::read(&file)?),
@@ -63,24 +63,29 @@ fn seconds(scene: &Scene<f32>) -> f64 {
     scene.clip[1] - scene.clip[0] + 1.0 / fps
 }
 
-/// Gives a source the sound that is requested; `near` is the file that is to be written.
+/// The sound that is requested for a scene with this one; `near` is the file that is to be written.
 ///
 /// Errors: a file that cannot be read or has no sound.
-pub(crate) fn choose(source: &mut Source, choice: &SoundChoice, near: &Path, console: &dyn Listener) -> Result<()> {
+pub(crate) fn chosen(
+    own: Option<Sound>,
+    choice: &SoundChoice,
+    scene: &Scene<f32>,
+    near: &Path,
+    console: &dyn Listener,
+) -> Result<Option<Sound>> {
     match choice {
-        SoundChoice::Kept => {}
-        SoundChoice::None => source.sound = None,
+        SoundChoice::Kept => Ok(own),
+        SoundChoice::None => Ok(None),
         SoundChoice::File(file) => {
             console.phase("converting the sound", 0, 0);
-            let (scene, clip) = (&source.scene, seconds(&source.scene));
+            let clip = seconds(scene);
             let sound = part(file, [0.0, clip], scene.clip[0], near)?;
             let length = sound.span[1] - sound.span[0];
             console.clear();
             console.result(&format!("{}: its first {length:.2} s, for a clip of {clip:.2} s", file.display()));
-            source.sound = Some(sound);
+            Ok(Some(sound))
         }
     }
-    Ok(())
 }
 
 /// Seconds `from` to `from + seconds` of a file as the sound that begins at second `start` of the scene.
@@ -127,8 +132,8 @@ pub(crate) fn edited(
 }
 
 /// Reports that a file has no place for the scene's sound.
-pub(crate) fn dropped(source: &Source, what: &str, console: &dyn Listener) {
-    if source.sound.is_some() {
+pub(crate) fn dropped(sound: Option<&Sound>, what: &str, console: &dyn Listener) {
+    if sound.is_some() {
         console.result(&format!("the sound is left out: {what} has no sound, .s4d and mp4 have"));
     }
 }
@@ -142,8 +147,8 @@ pub(crate) fn in_words(sound: &Sound) -> String {
 }
 
 /// Bytes of a file that remain for its Gaussians. Errors: the sound needs all of them.
-pub(crate) fn left(source: &Source, most: Option<u64>) -> Result<Option<u64>> {
-    let own = source.sound.as_ref().map_or(0, |s| s.mp4.len() as u64);
+pub(crate) fn left(sound: Option<&Sound>, most: Option<u64>) -> Result<Option<u64>> {
+    let own = sound.map_or(0, |s| s.mp4.len() as u64);
     let left = |most: u64| {
         most.checked_sub(own).filter(|left| *left > 0).ok_or_else(|| {
             Error::input(format!("the sound alone has {}, the file may have {}", human_bytes(own), human_bytes(most)))
@@ -180,7 +185,7 @@ mod tests {
         // What is baked has it, also when the capture was moved away.
         let plain = include_bytes!("../../splat4d/tests/data/tiny.s4d");
         let baked = playback::with_extras(plain, None, Some(&sound)).unwrap();
-        std::fs::write(run.join(playable::FILE), baked).unwrap();
+        std::fs::write(run.join(PLAYBACK), baked).unwrap();
         std::fs::rename(&capture, work.path().join("elsewhere")).unwrap();
         assert_eq!(of_run(&Run::open(&run).unwrap()).unwrap(), Some(sound));
     }
@@ -188,10 +193,9 @@ mod tests {
     #[test]
     fn sound_takes_part_of_a_size_limit() {
         let sound = Sound::try_from((0.0, TONE.to_vec())).unwrap();
-        let with = Source { sound: Some(sound), ..Source::own(Scene::default()) };
-        assert_eq!(left(&with, Some(10_000)).unwrap(), Some(10_000 - TONE.len() as u64));
-        assert!(left(&with, Some(1000)).unwrap_err().to_string().contains("the sound alone has"));
-        assert_eq!(left(&Source::own(Scene::default()), Some(1000)).unwrap(), Some(1000));
+        assert_eq!(left(Some(&sound), Some(10_000)).unwrap(), Some(10_000 - TONE.len() as u64));
+        assert!(left(Some(&sound), Some(1000)).unwrap_err().to_string().contains("the sound alone has"));
+        assert_eq!(left(None, Some(1000)).unwrap(), Some(1000));
     }
 
     #[test]

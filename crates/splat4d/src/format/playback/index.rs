@@ -2,7 +2,7 @@
 
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, FIRST_VERSION, GROWING, HEADER_BYTES, MAGIC, MASKED, MAX_PAGE_GAUSSIANS,
-    MAX_PALETTE, Meta, PAGE_WORDS, VERSION, sound,
+    MAX_PALETTE, Meta, PAGE_WORDS, VERSION,
 };
 use crate::math::sh;
 use crate::scene::features::MOST_CHANNELS;
@@ -22,6 +22,9 @@ pub(super) const NO_PALETTE: u32 = u32::MAX;
 /// Bytes of masks before their key times, and most of these (docs/format.md, "Masks").
 pub(super) const MASK_HEAD: usize = 8;
 pub(super) const MAX_KEYS: usize = 65_535;
+/// Most bytes of sound (docs/format.md, "Sound"): an hour at 128 kbit/s; and most seconds, a day: more is damage.
+pub(super) const MOST_SOUND: usize = 64 << 20;
+pub(super) const MOST_SECONDS: f64 = 86_400.0;
 /// Flag of an entry: readers that do not support the kind refuse the file.
 const REQUIRED: u32 = 1;
 
@@ -479,7 +482,7 @@ impl Entry {
     }
 
     /// Checks that the fields of an entry of a known kind fit together.
-    fn check(&self, words: usize) -> Result<()> {
+    pub(super) fn check(&self, words: usize) -> Result<()> {
         let most = match self.codec {
             Codec::Raw => u64::from(self.stored),
             Codec::Deflate => u64::from(self.stored) * MAX_DEFLATE,
@@ -535,7 +538,18 @@ impl Entry {
                     return Err(broken(format!("features of {count} Gaussians do not have {bytes} bytes")));
                 }
             }
-            Kind::Sound => sound::check(self)?,
+            Kind::Sound => {
+                let [from, to] = self.span;
+                if self.codec != Codec::Raw || self.bytes != self.stored || self.bytes as usize > MOST_SOUND {
+                    return Err(broken(format!(
+                        "sound of {} bytes, expected at most {MOST_SOUND} raw ones",
+                        self.stored
+                    )));
+                }
+                if !(from.is_finite() && to.is_finite() && from < to && to - from <= MOST_SECONDS) {
+                    return Err(broken(format!("sound cannot be played from {from} to {to} s")));
+                }
+            }
             Kind::Poster | Kind::Provenance | Kind::Other(_) => {}
         }
         Ok(())

@@ -44,11 +44,11 @@ pub use palette::Palette;
 pub(crate) use palette::decode_palette;
 #[cfg(test)]
 use provenance::with_provenance;
-pub use provenance::{Provenance, provenance, with_extras};
+pub use provenance::{Provenance, provenance};
 pub use read::read;
 #[cfg(test)]
 use sound::with_sound;
-pub use sound::{Sound, sound};
+pub use sound::{Sound, sound, with_extras};
 pub use strict::strict;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 

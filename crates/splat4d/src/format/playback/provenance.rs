@@ -1,9 +1,8 @@
 //! Provenance of a file: an optional section of JSON, which readers without support skip.
 
 use super::index::{broken, crc};
-use super::sound::with_sound;
 use super::write::GENERATOR;
-use super::{Codec, Entry, Index, Kind, Sound};
+use super::{Codec, Entry, Index, Kind};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -46,13 +45,6 @@ pub fn provenance(bytes: &[u8]) -> Result<Option<Provenance>> {
     }
     let wrong = |e| broken(format!("its provenance is invalid: {e}"));
     serde_json::from_slice(stored).map(Some).map_err(wrong)
-}
-
-/// The same file with this provenance and sound in place of its own, or without; all other sections keep their bytes.
-///
-/// Errors: not a playback file, a file that is cut short, more of either than a file holds.
-pub fn with_extras(bytes: &[u8], provenance: Option<&Provenance>, sound: Option<&Sound>) -> Result<Vec<u8>> {
-    with_sound(&with_provenance(bytes, provenance)?, sound)
 }
 
 /// With this provenance alone.

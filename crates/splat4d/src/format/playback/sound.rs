@@ -1,15 +1,11 @@
 //! Sound of a file: an optional section with an MP4 file of AAC, whose span places it on the scene clock. Readers
 //! without support skip it. What is inside the MP4 file is left to the decoder of the system; only its frame is checked.
 
-use super::index::{broken, crc};
-use super::provenance::with_section;
-use super::{Codec, Entry, Index, Kind};
+use super::index::{MOST_SECONDS, MOST_SOUND, broken, crc};
+use super::provenance::{with_provenance, with_section};
+use super::{Entry, Index, Kind, Provenance};
 use crate::{Error, Result};
 
-/// Most bytes of the section (docs/format.md, "Sound"): an hour at 128 kbit/s.
-pub(super) const MOST_BYTES: usize = 64 << 20;
-/// Most seconds: a day. Numbers beyond are damage.
-const MOST_SECONDS: f64 = 86_400.0;
 /// Largest difference of the section's span and the MP4 file's length, seconds: two frames of AAC at 48 kHz.
 const LENGTH_ERROR: f64 = 0.05;
 /// Most boxes at one level of an MP4 file; encoders write fewer than ten.
@@ -33,8 +29,8 @@ impl TryFrom<(f64, Vec<u8>)> for Sound {
     /// From the second at which its first sample is heard, and the MP4 file. Errors: another kind of file, damage, more
     /// than a file holds.
     fn try_from((start, mp4): (f64, Vec<u8>)) -> Result<Self> {
-        if mp4.len() > MOST_BYTES {
-            return Err(Error::input(format!("the sound has {} bytes, a file holds {MOST_BYTES}", mp4.len()))
+        if mp4.len() > MOST_SOUND {
+            return Err(Error::input(format!("the sound has {} bytes, a file holds {MOST_SOUND}", mp4.len()))
                 .remedy("Give a shorter part of it, or one with a lower bit rate"));
         }
         if !start.is_finite() {
@@ -64,9 +60,14 @@ pub fn sound(bytes: &[u8]) -> Result<Option<Sound>> {
     Ok(Some(Sound { span: entry.span, ..sound }))
 }
 
-/// The same file with this sound in place of its own, or without any, behind all other sections, which keep their bytes.
+/// The same file with this provenance and sound in place of its own, or without; all other sections keep their bytes.
 ///
-/// Errors: not a playback file, a file that is cut short, more sound than a file holds.
+/// Errors: not a playback file, a file that is cut short, more of either than a file holds.
+pub fn with_extras(bytes: &[u8], provenance: Option<&Provenance>, sound: Option<&Sound>) -> Result<Vec<u8>> {
+    with_sound(&with_provenance(bytes, provenance)?, sound)
+}
+
+/// With this sound alone, behind all other sections.
 pub(super) fn with_sound(bytes: &[u8], new: Option<&Sound>) -> Result<Vec<u8>> {
     with_section(bytes, Kind::Sound, new.map(Sound::section).transpose()?)
 }
@@ -75,21 +76,9 @@ impl Sound {
     /// Its section. Errors: numbers that no reader accepts.
     pub(super) fn section(&self) -> Result<(Entry, Vec<u8>)> {
         let entry = Entry { span: self.span, ..Entry::plain(Kind::Sound, &self.mp4) };
-        check(&entry)?;
+        entry.check(0)?;
         Ok((entry, self.mp4.clone()))
     }
-}
-
-/// Checks the fields of the section's entry.
-pub(super) fn check(entry: &Entry) -> Result<()> {
-    let [from, to] = entry.span;
-    if entry.codec != Codec::Raw || entry.bytes != entry.stored || entry.bytes as usize > MOST_BYTES {
-        return Err(broken(format!("sound has {} bytes as they are, at most {MOST_BYTES}", entry.stored)));
-    }
-    if !(from.is_finite() && to.is_finite() && from < to && to - from <= MOST_SECONDS) {
-        return Err(broken(format!("sound cannot be played from {from} to {to} s")));
-    }
-    Ok(())
 }
 
 /// Seconds of an MP4 file (ISO/IEC 14496-12 and -14) with one track of AAC and nothing else.
