@@ -432,7 +432,7 @@ static int is(const section *s, const char *kind) { return memcmp(s->kind, kind,
 static int of_page(const section *s) { return is(s, "MASK") || is(s, "LABL") || is(s, "FEAT"); }
 
 static int known(const section *s) {
-    return is(s, "PAGE") || is(s, "PALT") || of_page(s) || is(s, "POST") || is(s, "PROV");
+    return is(s, "PAGE") || is(s, "PALT") || of_page(s) || is(s, "POST") || is(s, "PROV") || is(s, "SOUN");
 }
 
 const char *s4d_text(s4d_status status) {
@@ -1057,7 +1057,7 @@ s4d_status s4d_verify(s4d_file *f) {
         if (s->offset > f->size || s->stored > f->size - s->offset) return S4D_SHORT;
         s4d_status status = S4D_OK;
         if (is(s, "PALT")) status = decode_palette(f, i);
-        if (is(s, "POST") || is(s, "PROV")) {
+        if (is(s, "POST") || is(s, "PROV") || is(s, "SOUN")) {
             uint8_t *bytes;
             status = body(f, i, &bytes);
             free(bytes);

@@ -122,7 +122,7 @@ typedef struct s4d_arrays {
 
 /* An entry of the table of sections. */
 typedef struct s4d_section {
-    /* Four characters: PAGE, PALT, MASK, LABL, FEAT, POST, PROV, or a kind that is newer. */
+    /* Four characters: PAGE, PALT, MASK, LABL, FEAT, POST, PROV, SOUN, or a kind that is newer. */
     char kind[4];
     /* Place and size in the file. */
     uint64_t offset;

@@ -26,6 +26,7 @@ HEADER, ENTRY = 64, 64
 MOST_INDEX, MOST_SECTIONS = 64 << 20, 1_000_000
 MOST_ROWS, MOST_ENTRIES, MOST_KEYS, MOST_CHANNELS = 65_536, 65_536, 65_535, 64
 MOST_PROVENANCE = 1 << 20
+MOST_SOUND = 64 << 20
 BLOCK, NUMBERS, WORDS = 256, 24, 8
 RAW, DEFLATE = 0, 1
 REQUIRED = 1
@@ -34,7 +35,7 @@ MOST_LOG = 40.0
 # Largest ratio of sizes of one deflate stream; of a whole file, with some bytes more for small ones.
 DEFLATE_MOST, FILE_MOST, FILE_SMALL = 1032, 64, 64 << 20
 VISIBLE = 1.0 / 255.0
-KNOWN = {b"PAGE", b"PALT", b"MASK", b"LABL", b"FEAT", b"POST", b"PROV"}
+KNOWN = {b"PAGE", b"PALT", b"MASK", b"LABL", b"FEAT", b"POST", b"PROV", b"SOUN"}
 # Keys that the JSON needs, and how many numbers each has; 0: one number by itself.
 KEYS = {"clip": 2, "fps": 0, "up": 3, "background": 3, "sh_degree": 0, "gaussians": 0}
 
@@ -214,6 +215,16 @@ class Scene:
         """The bytes of the image, or None."""
         posters = self.of_kind(b"POST")
         return self.body(posters[0]) if posters else None
+
+    @property
+    def sound(self):
+        """(first second, last second, the bytes of an MP4 file of AAC), or None."""
+        sections = self.of_kind(b"SOUN")
+        if not sections:
+            return None
+        section = self.sections[sections[0]]
+        check(section.codec == RAW and section.stored <= MOST_SOUND, "the sound is too large or not raw")
+        return section.first, section.last, self.body(sections[0])
 
     @property
     def provenance(self):

@@ -20,6 +20,8 @@ mod import;
 mod predict;
 #[path = "cli/sample.rs"]
 mod sample;
+#[path = "cli/sound.rs"]
+mod sound;
 #[path = "cli/trained.rs"]
 mod trained;
 

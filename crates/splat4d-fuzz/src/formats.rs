@@ -6,7 +6,7 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 use splat4d::format::dialect::{WriteOptions, still};
-use splat4d::format::playback::{self, HEADER_BYTES, Index};
+use splat4d::format::playback::{self, HEADER_BYTES, Index, Sound};
 use splat4d::format::sog::levels;
 use splat4d::format::{DIALECTS, foreign, npy, ply, safetensors, scene, sog, splat};
 use splat4d::layers::{Evaluation, Layer, Scene};
@@ -23,6 +23,7 @@ use tempfile::TempDir;
 
 pub(crate) const READERS: &[Reader] = &[
     Reader { name: "playback", seeds: playback_seeds, read: playback_file },
+    Reader { name: "sound_mp4", seeds: sound_seeds, read: sound_file },
     Reader { name: "ply", seeds: || written(".ply"), read: open },
     Reader { name: "ply_points", seeds: point_seeds, read: |b| drop(ply::read_points(b)) },
     Reader { name: "ply_compressed", seeds: || written(".compressed.ply"), read: open },
@@ -292,15 +293,28 @@ fn npz_seeds() -> Vec<Vec<u8>> {
 }
 
 fn playback_seeds() -> Vec<Vec<u8>> {
-    vec![include_bytes!("../../splat4d/tests/data/tiny.s4d").to_vec()]
+    let plain = include_bytes!("../../splat4d/tests/data/tiny.s4d");
+    let sound = Sound::try_from((0.0, TONE.to_vec())).expect("a tone");
+    vec![plain.to_vec(), playback::with_extras(plain, None, Some(&sound)).expect("a file with sound")]
+}
+
+/// A tone.
+const TONE: &[u8] = include_bytes!("../../splat4d/tests/data/tone.m4a");
+
+fn sound_seeds() -> Vec<Vec<u8>> {
+    vec![TONE.to_vec()]
+}
+
+fn sound_file(bytes: &[u8]) {
+    let _ = Sound::try_from((0.0, bytes.to_vec()));
 }
 
 /// Reads a playback file unchanged, and with its checksums corrected: almost every input would stop at these.
 fn playback_file(bytes: &[u8]) {
     let look = |bytes: &[u8]| {
-        let _ = Index::needed(bytes);
         let _ = Index::parse(bytes, Some(bytes.len() as u64));
         let _ = playback::provenance(bytes);
+        let _ = playback::sound(bytes);
         if let Ok(scene) = playback::read(bytes) {
             show(&scene);
         }

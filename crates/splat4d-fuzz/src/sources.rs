@@ -82,6 +82,8 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("recording/assist.rs", Not("a file of points is renamed; its reader is `clicks`")),
     ("recording/cache.rs", Not("values of an import, in plain data; what cannot be read is made again")),
     ("recording/colmap.rs", Not("a note of our own that is compared, masks that are copied and a log that is shown")),
+    ("recording/soundtrack.rs", By(&["sound_mp4"])),
+    ("sound.rs", By(&["sound_mp4", "capture_json", "playback"])),
     ("training.rs", By(&["scene"])),
     ("exporting.rs", By(&["points"])),
     ("verbs/predict.rs", By(&["actions"])),

@@ -31,12 +31,15 @@ export interface Splat4DAttributes {
   poster?: string;
   theme?: 'auto' | 'light' | 'dark';
   heading?: string;
+  /** Without sound. */
+  muted?: boolean;
   page?: boolean;
 }
 
 export interface Splat4DEventMap extends HTMLElementEventMap {
   load: CustomEvent<{ meta: Record<string, unknown>; milliseconds: number }>;
   timeupdate: CustomEvent<{ time: number }>;
+  volumechange: CustomEvent;
   channelchange: CustomEvent<{ channel: Channel }>;
   camerachange: CustomEvent<{ camera: CameraState }>;
   error: CustomEvent<{ what: string; where: string; remedy: string }> & ErrorEvent;
@@ -53,6 +56,9 @@ export class Splat4D extends HTMLElement {
   readonly seeking: boolean;
   readonly duration: number;
   readonly paused: boolean;
+  muted: boolean;
+  /** 0 to 1. */
+  volume: number;
   get camera(): CameraState;
   set camera(camera: Partial<CameraState>);
   set scene(source: File | Blob | ArrayBuffer);

@@ -7,6 +7,20 @@ export interface Splat4DOptions {
   budget?: number;
   /** The object's axis that points up as the file's up does; null keeps the file's axes. 'y' where left out. */
   up?: 'x' | 'y' | 'z' | null;
+  /** Load the file's sound after the first image, and play it with the clock. */
+  sound?: boolean;
+}
+
+/** What is heard; it fires volumechange. */
+export interface Sound extends EventTarget {
+  muted: boolean;
+  /** 0 to 1. */
+  volume: number;
+  /** The browser refuses to play before a gesture of the page's user: call `touched` in one. */
+  readonly blocked: boolean;
+  touched(): void;
+  /** Whether the file's sound is loaded. */
+  readonly there: boolean;
 }
 
 /** A moving scene of Gaussians as an object of three.js; works with WebGLRenderer. */
@@ -31,6 +45,8 @@ export class Splat4D extends Mesh {
   readonly objectFromFile: Matrix4;
   readonly duration: number;
   readonly drawn: number;
+  /** Null without the option. */
+  readonly sound: Sound | null;
   /** Resolves when `time` is loaded and the next image shows it. */
   settled(): Promise<void>;
   dispose(): void;

@@ -12,6 +12,7 @@ import { BATCH, CHANNELS, ORDER_WIDTH, SPLAT } from './player/glsl.js';
 import { Order } from './player/order.js';
 import { Follower, Schedule, advance } from './player/schedule.js';
 import { SceneFile } from './player/scene-file.js';
+import { Sound } from './player/sound.js';
 import { Stream } from './player/stream.js';
 import { BLOCKS_WIDTH, J_MARGIN, WIDTH, blockTexels, corners, paletteTexels } from './player/texels.js';
 import { Rows } from './player/gl.js';
@@ -82,6 +83,8 @@ export class Splat4D extends THREE.Mesh {
   ready;
   /// Whether it begins again at the end; played once, it stops at the last frame.
   loop = true;
+  /// What is heard, with the option `sound`.
+  sound = null;
   /// Takes what the file calls up, once it is open, to the object's `up`; multiply a pose of the file by it.
   objectFromFile = new THREE.Matrix4();
   #time = 0;
@@ -108,13 +111,16 @@ export class Splat4D extends THREE.Mesh {
   #drawn = 0;
   #onchange;
   #waiting = [];
+  /// Whether sound is to be loaded.
+  #sounds;
   #scratch = { view: new THREE.Matrix4(), viewport: new THREE.Vector4(), rows: new Float64Array(12) };
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better image can be drawn: pages
   /// came,
   /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`:
-  /// the object's axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
-  constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
+  /// the object's axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes. `sound`: the
+  /// file's sound plays with the clock.
+  constructor(source, { onchange = () => {}, budget, up = 'y', sound = false } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();
     geometry.setIndex(new THREE.BufferAttribute(corners(), 1));
     geometry.instanceCount = 0;
@@ -145,6 +151,8 @@ export class Splat4D extends THREE.Mesh {
     // Its bounds depend on time, and all culling is the shader's.
     this.frustumCulled = false;
     this.#onchange = onchange;
+    if (sound) this.sound = new Sound();
+    this.#sounds = sound;
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     this.#schedule = new Schedule(this.#order);
     this.ready = SceneFile.open(source).then((file) => {
@@ -241,6 +249,7 @@ export class Splat4D extends THREE.Mesh {
 
   dispose() {
     this.#gone = true;
+    this.sound?.drop();
     this.#stream?.destroy();
     this.#file?.close();
     this.#order.destroy();
@@ -293,13 +302,27 @@ export class Splat4D extends THREE.Mesh {
     if (frame === this.#frame) return;
     this.#frame = frame;
     const { clip } = this.meta;
-    if (!this.#playing) return this.#follower.set(this.#time, now, clip);
+    if (this.#sounds && this.#drawn) {
+      this.#sounds = false;
+      this.sound.load(this.#file).catch(() => {});
+    }
+    if (!this.#playing) {
+      this.#hear(false);
+      return this.#follower.set(this.#time, now, clip);
+    }
     const step = Math.min((now - this.#now) / 1000 || 0, STEP_MAX);
     this.#now = now;
-    if (!this.#stream.playable(this.#time)) return;
-    const { time, ended } = advance(this.#time, step * this.#speed, this.#clip);
-    this.#time = time;
-    if (ended) this.#playing = false;
+    const playable = this.#stream.playable(this.#time);
+    if (playable) {
+      const { time, ended } = advance(this.#time, step * this.#speed, this.#clip);
+      this.#time = time;
+      if (ended) this.#playing = false;
+    }
+    this.#hear(playable && this.#playing);
+  }
+
+  #hear(running) {
+    this.sound?.follow(this.#time, { running, speed: this.#speed, epoch: this.#epoch });
   }
 
   get #clip() {

@@ -7,10 +7,10 @@ import { h } from './dom.js';
 import { readLink, vector } from './camera.js';
 
 const OBSERVED = ['src', 'controls', 'time', 'speed', 'loop', 'backend', 'channel', 'background', 'camera', 'poster',
-  'theme', 'resolution', 'heading'];
+  'theme', 'resolution', 'heading', 'muted'];
 /** Events of the player that the element shows to its page. */
 const EVENTS = ['load', 'timeupdate', 'play', 'pause', 'ended', 'error', 'camerachange', 'channelchange', 'labelschange',
-  'ratechange'];
+  'ratechange', 'volumechange'];
 
 /** Hosts of pages that are being written. */
 const LOCAL = ['', 'localhost', '127.0.0.1', '[::1]'];
@@ -110,6 +110,7 @@ export class Splat4D extends HTMLElement {
       poster: () => value && ui.setPoster(new URL(value, document.baseURI).href),
       theme: () => value && ui.setTheme(['light', 'dark'].includes(value) ? value : 'auto'),
       resolution: () => value && ui.setResolution(value === 'auto' ? value : +value),
+      muted: () => { p.sound.muted = value !== null; },
       heading: () => ui.setTitle(value ?? p.meta?.title),
     };
     set[name]?.();
@@ -173,6 +174,10 @@ export class Splat4D extends HTMLElement {
   get currentTime() { return this.#player?.time ?? 0; }
   set currentTime(t) { this.seek(t); }
   get seeking() { return this.#player?.seeking ?? false; }
+  get muted() { return this.#player?.sound.muted ?? this.hasAttribute('muted'); }
+  set muted(on) { if (this.#player) this.#player.sound.muted = on; else this.toggleAttribute('muted', !!on); }
+  get volume() { return this.#player?.sound.volume ?? 1; }
+  set volume(x) { if (this.#player) this.#player.sound.volume = x; }
   get duration() { return this.#player?.duration ?? 0; }
   get statistics() { return this.#player?.statistics; }
   /** {position, quat (world from camera, wxyz), target, fov degrees}; setting takes any of them. */

@@ -13,7 +13,7 @@ const BACKGROUNDS = { scene: null, black: [0, 0, 0], grey: [0.5, 0.5, 0.5], whit
 
 const KEYS = [
   ['Play or pause', 'Space'], ['Seek', '←', '→'], ['One frame', ',', '.'], ['Start, end', 'Home', 'End'],
-  ['Slower, faster', '[', ']'], ['Loop', 'L'], ['Channel', 'C'], ['Cameras', '1', '…', '9'],
+  ['Slower, faster', '[', ']'], ['Loop', 'L'], ['Sound', 'U'], ['Channel', 'C'], ['Cameras', '1', '…', '9'],
   ['Next camera', 'N'], ['Reset the view', 'R'], ['Orbit or fly', 'M'], ['Move', 'W', 'A', 'S', 'D'],
   ['Down, up', 'Q', 'E'], ['Move faster', 'Shift'], ['Turn', 'Shift + arrows'], ['Zoom', '↑', '↓'],
   ['Add a camera key', 'K'], ['Play the camera path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Statistics', 'I'],

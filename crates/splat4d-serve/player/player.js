@@ -8,6 +8,7 @@ import { Cost, Pace } from './pace.js';
 import { SceneError, cutShort } from './errors.js';
 import { SceneFile } from './scene-file.js';
 import { advance } from './schedule.js';
+import { Sound } from './sound.js';
 import { Stream } from './stream.js';
 import { Track } from './track.js';
 
@@ -58,6 +59,7 @@ export class Player extends EventTarget {
   /** The clock waits because pages of its time are missing. */
   waiting = false;
   loop = true;
+  sound = new Sound();
   meta = null;
   file = null;
   backend = null;
@@ -119,6 +121,7 @@ export class Player extends EventTarget {
     // Frames that a hidden tab left out were not slow, and its clock was stopped.
     this.sleeps = () => { this.#interval = this.#last = 0; };
     document.addEventListener('visibilitychange', this.sleeps);
+    this.sound.addEventListener('volumechange', () => this.emit('volumechange'));
     const loop = now => { this.#frame = requestAnimationFrame(loop); this.#tick(now); };
     this.#frame = requestAnimationFrame(loop);
   }
@@ -173,7 +176,9 @@ export class Player extends EventTarget {
       if (file.truncated) this.emit('trouble', { error: cutShort(file, source), lasting: true });
       this.figures.opened = performance.now() - began;
       await this.#firstPicture(run, began, keep);
-      if (run === this.#run) this.emit('load', { meta: file.meta, milliseconds: this.figures.firstFrame });
+      if (run !== this.#run) return;
+      this.emit('load', { meta: file.meta, milliseconds: this.figures.firstFrame });
+      this.sound.load(file).catch(error => { if (run === this.#run) this.#pageFailed(error); });
     } catch (error) {
       if (run !== this.#run || error.name === 'AbortError') return;
       // A new version that cannot be had leaves the old one where it is.
@@ -189,6 +194,7 @@ export class Player extends EventTarget {
     this.file = file;
     this.meta = file.meta;
     if (!keep) this.labels = { colors: false, only: null };
+    if (!keep) this.sound.drop();
     this.#attach();
     this.#held = keep ? performance.now() + PATIENCE : 0;
     this.#epoch++;
@@ -238,6 +244,13 @@ export class Player extends EventTarget {
   async #poster(file, run) {
     const blob = await file.poster().catch(() => null);
     if (blob && run === this.#run && this.state === 'loading') this.emit('poster', { blob });
+  }
+
+  /** Passes the clock of this very moment to the sound. */
+  #hear() {
+    const late = (performance.now() - this.#last) / 1000 * this.#speed;
+    const running = this.playing && !this.waiting && this.state === 'ready';
+    this.sound.follow(this.clock + late, { running, speed: this.#speed, epoch: this.#epoch });
   }
 
   async #firstPicture(run, began, keep) {
@@ -512,6 +525,7 @@ export class Player extends EventTarget {
     this.controls.tick(dt);
     this.#moveCamera(dt);
     this.#moveTime(dt);
+    this.#hear();
     this.#draw(now);
     this.#tell(now);
   }
@@ -752,6 +766,7 @@ export class Player extends EventTarget {
   advance(dt) {
     this.#last = performance.now();
     if (this.#stream) this.#moveTime(dt);
+    this.#hear();
     this.#tellTime();
   }
 
@@ -762,6 +777,7 @@ export class Player extends EventTarget {
     document.removeEventListener('visibilitychange', this.sleeps);
     this.resizes.disconnect();
     this.sight.disconnect();
+    this.sound.drop();
     this.#stream?.destroy();
     this.backend?.destroy();
     this.file?.close();

@@ -1,4 +1,5 @@
-// A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster. Trusts no number of it.
+// A playback file (docs/format.md), read in parts: index, pages, key masks, palettes, poster, sound. Trusts no number of
+// it.
 
 import { worker } from './assets.js';
 import { NEAR } from './camera.js';
@@ -32,6 +33,9 @@ const SMALL_MASK = 64 << 20,
   MASK_RATIO = 64;
 /// A poster larger than this is no preview, bytes.
 const MAX_POSTER = 32 << 20;
+/// More sound is refused, bytes; and what its bytes 4 to 7 are.
+const MAX_SOUND = 64 << 20,
+  MP4 = 'ftyp';
 /// Workers: inflating a page takes some ms, and the network is slower than two.
 const WORKERS = (globalThis.navigator?.hardwareConcurrency ?? 2) > 2 ? 2 : 1;
 
@@ -189,6 +193,15 @@ export class SceneFile {
     return new Blob([bytes], { type: bytes[0] === MAGIC[0] ? 'image/png' : 'image/jpeg' });
   }
 
+  /// The sound: {blob, span: its first and last second on the scene's clock}, or null.
+  async sound({ signal } = {}) {
+    const entry = this.sections.find((s) => s.kind === 'SOUN' && !s.missing);
+    if (!entry) return null;
+    const { bytes } = await this.#decoded(entry, signal, 0);
+    if (String.fromCharCode(...bytes.subarray(4, 8)) !== MP4) this.#refuse(`Section ${entry.id} (SOUN) is not an MP4 file`);
+    return { blob: new Blob([bytes], { type: 'audio/mp4' }), span: [entry.from, entry.to] };
+  }
+
   /// `time` held inside the clip.
   clamp(time) {
     const [first, last] = this.meta.clip;
@@ -339,13 +352,18 @@ export class SceneFile {
     section.missing = offset + stored > this.bytesTotal;
     const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
     if (!(offset >= HEAD && offset + stored <= length)) refuse('lies outside the file');
-    if (!['PAGE', 'PALT', 'POST', 'MASK', 'LABL'].includes(kind)) {
+    if (!['PAGE', 'PALT', 'POST', 'MASK', 'LABL', 'SOUN'].includes(kind)) {
       if (section.flags & 1) refuse('is of a kind that this player does not support', 'Use a newer player.');
       return section;
     }
     if (codec > 1) refuse(`has the unknown compression method ${codec}`, 'Use a newer player.');
     if (codec === 0 ? stored !== bytes : bytes > DEFLATE_RATIO * stored) refuse('cannot have the stated size');
     if (kind === 'POST') return section;
+    if (kind === 'SOUN') {
+      if (codec !== 0 || bytes > MAX_SOUND) refuse(`has ${bytes} bytes, expected at most ${MAX_SOUND}, uncompressed`);
+      if (!(section.from < section.to && Number.isFinite(section.to - section.from))) refuse('has no valid time range');
+      return section;
+    }
     if (count < 1 || count > MAX_COUNT) refuse(`has ${count} entries, expected 1 to ${MAX_COUNT}`);
     if (kind === 'MASK') {
       this.#checkMask(section, u32(56), refuse);

@@ -58,6 +58,7 @@ export class Interface {
       cameras: opener('camera', 'Cameras and paths', 'cameras'),
       view: opener('view', 'View and settings', 'view'),
     };
+    this.soundTool = tool('sound', 'Mute', () => this.toggleSound(), { hidden: true });
     this.full = tool('full', 'Full screen', () => this.fullscreen());
     this.xrTool = tool('headset', 'View in VR', () => this.xr?.('immersive-vr'), { hidden: true });
     this.arTool = tool('room', 'View in AR; tap the floor to place the scene', () => this.xr?.('immersive-ar'), { hidden: true });
@@ -67,7 +68,7 @@ export class Interface {
     const steps = this.embed ? [] : [this.back, this.next];
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
-        this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
+        this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.soundTool, this.xrTool, this.arTool, this.full));
     // Without space, an element of a user's page keeps what plays.
     for (const item of [this.back, this.next, this.loopTool, this.speed, ...spare]) item.classList.add('spare');
     this.root.classList.toggle('page', this.page);
@@ -130,7 +131,7 @@ export class Interface {
     const p = this.player;
     const on = (name, f) => p.addEventListener(name, f);
     on('timeupdate', () => this.#showTime());
-    for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'labelschange', 'film', 'mode', 'backend']) {
+    for (const name of ['play', 'pause', 'ratechange', 'channelchange', 'labelschange', 'film', 'mode', 'backend', 'volumechange']) {
       on(name, () => this.refresh());
     }
     on('scene', () => {
@@ -166,6 +167,10 @@ export class Interface {
       if (tap && !tap.idle && Math.hypot(e.clientX - tap.x, e.clientY - tap.y) < 8 && p.playing) this.sleep();
     });
     this.root.addEventListener('focusin', () => this.wake());
+    // Browsers allow sound once the page was touched; the sound's own control is a touch too.
+    const touched = e => { if (!this.soundTool.contains(e.composedPath()[0])) p.sound.touched(); };
+    this.root.addEventListener('pointerup', touched);
+    this.root.addEventListener('keydown', touched);
     const keys = this.page ? window : this.root;
     this.#on(keys, 'keydown', e => this.#key(e));
     this.#on(keys, 'keyup', e => { p.controls.key(e.code, false); this.#turnKey(e, false); });
@@ -198,6 +203,9 @@ export class Interface {
     const p = this.player, moving = p.playing || (p.film && !p.film.frozen);
     retool(this.play, moving ? 'pause' : 'play', moving ? 'Pause' : 'Play');
     for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.disabled = p.still || !p.file;
+    const { there, audible, blocked } = p.sound;
+    this.soundTool.hidden = !there;
+    retool(this.soundTool, audible ? 'sound' : 'silent', blocked ? 'Sound on (the browser waits for a click)' : audible ? 'Mute' : 'Sound on');
     this.scrub.hidden = p.still;
     this.timeLabel.hidden = p.still;
     for (const item of [this.play, this.back, this.next, this.loopTool, this.speed]) item.hidden = !!p.file && p.still;
@@ -391,6 +399,15 @@ export class Interface {
     this.player.loop = on;
     this.toast(on ? 'Loop' : 'Play once');
     this.refresh();
+  }
+
+  /** Sound on or off; where the browser waits for a gesture, this is one. */
+  toggleSound() {
+    const { sound } = this.player;
+    if (!sound.there) return;
+    if (sound.blocked) sound.touched();
+    else sound.muted = !sound.muted;
+    this.toast(sound.muted ? 'Muted' : 'Sound on');
   }
 
   setResolution(value) {
@@ -598,7 +615,7 @@ export class Interface {
       },
       k: () => this.addKey(), p: () => this.playPath(), b: () => this.bullet(),
       f: () => this.fullscreen(), i: () => this.setFigures(!this.figuresOn), g: () => this.screenshot(),
-      x: () => this.editing?.toggle(),
+      u: () => this.toggleSound(), x: () => this.editing?.toggle(),
       v: () => this.showCameras(), z: () => this.compare(),
       t: () => this.setTheme(this.dark ? 'light' : 'dark'), h: () => this.toggleHelp(), '?': () => this.toggleHelp(),
     };

@@ -46,6 +46,7 @@ const FILES: &[(&str, &str)] = player![
     "scene-file.js",
     "schedule.js",
     "shaders.js",
+    "sound.js",
     "sort.worker.js",
     "stream.js",
     "style.js",

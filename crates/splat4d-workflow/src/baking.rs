@@ -9,6 +9,8 @@ use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
+use crate::sound;
+pub use crate::sound::SoundChoice;
 use crate::source::{Source, not_empty};
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
@@ -84,6 +86,8 @@ pub struct Baking {
     /// Most entries of the palette.
     pub palette: usize,
     pub poster: bool,
+    /// What is heard; only [`bake`] uses it.
+    pub sound: SoundChoice,
     /// When it is to be done.
     pub deadline: Deadline,
 }
@@ -96,6 +100,7 @@ impl Default for Baking {
             bytes: None,
             palette: WriteConfig::default().palette,
             poster: true,
+            sound: SoundChoice::Kept,
             deadline: Deadline::default(),
         }
     }
@@ -247,9 +252,14 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
             .at(out.display())
             .remedy("Use option `output` NAME.s4d."));
     }
-    let source = Source::open(from)?;
+    let mut source = Source::open(from)?;
     not_empty(&source.scene, from)?;
-    source.keep_all(from, &std::iter::once(out).chain(report).collect::<Vec<_>>(), &[])?;
+    let read = if let SoundChoice::File(file) = &baking.sound { vec![file.as_path()] } else { Vec::new() };
+    source.keep_all(from, &std::iter::once(out).chain(report).collect::<Vec<_>>(), &read)?;
+    source.sound = sound::chosen(source.sound.take(), &baking.sound, &source.scene, out, listener)?;
+    if baking.options.repeat > 1 && source.sound.take().is_some() {
+        listener.result("the sound is left out: option `repeat` repeats the clip, and would need it repeated");
+    }
     let value = bake_into(&source, &title(&source, from), out, baking, listener)?;
     if let Some(path) = report {
         files::write(path, format!("{value:#}").as_bytes())?;
@@ -261,10 +271,11 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
 /// Bakes into the file `out` and states how well; returns the report. The options' cameras are the source's.
 pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, console: &dyn Listener) -> Result<Value> {
     let started = baking.deadline.now();
+    let baking = &Baking { bytes: sound::left(source.sound.as_ref(), baking.bytes)?, ..baking.clone() };
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
     let Packed { mut bytes, baked, summary, antialias, .. } = packed;
-    if source.provenance.is_some() {
-        bytes = playback::with_provenance(&bytes, source.provenance.as_ref())?;
+    if source.provenance.is_some() || source.sound.is_some() {
+        bytes = playback::with_extras(&bytes, source.provenance.as_ref(), source.sound.as_ref())?;
     }
     files::write(out, &bytes)?;
     let seconds = baking.deadline.now() - started;
@@ -281,9 +292,13 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
         "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,
+        "sound_bytes": source.sound.as_ref().map_or(0, |s| s.mp4.len()),
         "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
     print_summary(report, likeness.as_ref(), summary.bytes, seconds, console);
+    if let Some(sound) = &source.sound {
+        console.result(&format!("sound: {}", sound::in_words(sound)));
+    }
     if report.primitives == 0 {
         console.warn("no Gaussian of the scene is visible at any time of the clip: the file renders as background.");
     }

@@ -9,12 +9,13 @@ use crate::events::{Listener, Recorded};
 use crate::measure::{SIZE, Side, Subject, What, in_turns, measured_views_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
 use crate::run_folder::{self, COMPRESS, ORDER, Origin, Run};
+use crate::sound;
 use crate::source::{Source, not_empty, read_scene};
 use crate::{files, playable, report};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use splat4d::device::Device;
-use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, write_pages};
+use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, with_extras, write_pages};
 use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
@@ -498,6 +499,8 @@ impl Work {
     fn choose_size(&mut self, original: &Original<'_>, console: &dyn Listener) -> Result<()> {
         let begun = !checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
         let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };
+        let sound = sound::of_run(&Run::open(original.run)?).ok().flatten();
+        let sound_bytes = sound.map_or(0, |s| s.mp4.len() as u64);
         let settings = self.order.settings.clone();
         let scores = compress::scores(&original.job(&settings), &mut |d, t| console.phase("scoring Gaussians", d, t))?;
         let cameras = compress::cameras(&original.capture);
@@ -507,7 +510,7 @@ impl Work {
             &settings,
             self.order.free,
             &cameras,
-            [most, BESIDES],
+            [most, BESIDES + sound_bytes],
             &mut |done, total| console.phase("searching for the size", done, total),
         )?;
         console.clear();
@@ -559,7 +562,11 @@ impl Work {
         let draft = PagesDraft { meta: &meta, ..pages.draft(poster.as_deref()) };
         let config = WriteConfig { depths: self.order.settings.depths, ..WriteConfig::default() };
         let mut bytes = Vec::new();
-        let summary = write_pages(&draft, &config, &mut bytes)?;
+        let mut summary = write_pages(&draft, &config, &mut bytes)?;
+        if source.sound.is_some() {
+            bytes = with_extras(&bytes, None, source.sound.as_ref())?;
+            summary.bytes = bytes.len() as u64;
+        }
         files::write(&self.dir.join(playable::FILE), &bytes)?;
         Ok(summary)
     }

@@ -6,12 +6,13 @@ use crate::files::{self, either, grouped, human_bytes};
 use crate::programs::Program;
 use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
+use crate::sound;
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::bake::Likeness;
 use splat4d::format::dialect::{self, WriteOptions};
 use splat4d::format::linear::from_linear;
-use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
+use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback};
 use splat4d::layers::{self, Constant, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -147,7 +148,7 @@ impl Conversion {
             exact: false,
             world: false,
             linear: Vec::new(),
-            spz_version: spz::DEFAULT_VERSION,
+            spz_version: WriteOptions::default().spz_version,
             program: None,
         }
     }
@@ -218,6 +219,9 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let (pattern, target) = asked(args)?;
     if args.no_provenance {
         source.provenance = None;
+    }
+    if target != Target::Playback {
+        sound::dropped(source.sound.as_ref(), target.name(), console);
     }
     if let Some(degree) = args.sh {
         let had = source.scene.limit_sh(degree.into());

@@ -6,6 +6,7 @@ use crate::events::Listener;
 use crate::files::{self, grouped};
 use crate::paths::View;
 use crate::run_folder::Run;
+use crate::sound;
 use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::edit::{Context, Edits, Expr, Mask, Selected, Step, count, mask_fits, replay};
@@ -125,6 +126,13 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
     console.emit(&json!({"type": "edited", "before": before, "gaussians": scene.len(), "layers": scene.layers.len(),
         "steps": done}));
     source.scene = scene;
+    if let (Some(own), Some(output)) = (source.sound.take(), &options.output) {
+        // Files of other formats have none anyway.
+        source.sound = match files::is_playback(output) {
+            true => sound::edited(own, &edits.steps, &source.scene, output, console),
+            false => Some(own),
+        };
+    }
     let earlier = source.provenance.take();
     source.provenance = (!options.no_provenance).then(|| provenance(&source, earlier, &edits, options.note.clone()));
     if let Some(path) = &options.save {

@@ -610,7 +610,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, stop: &AtomicBool, console: &dyn Listen
     let mut painter = Painter::new(scene, scene.background, antialias, false);
     let path = run.join(name);
     let first = &shots[0].camera;
-    let mut film = Film::create(&path, [first.width, first.height], fps, shots.len())?;
+    let mut film = Film::create(&path, [first.width, first.height], fps, shots.len(), None)?;
     for (i, shot) in shots.iter().enumerate() {
         unless_stopped(stop)?;
         painter.draw(&shot.camera, shot.time);

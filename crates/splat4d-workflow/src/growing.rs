@@ -7,6 +7,7 @@ use crate::events::Listener;
 use crate::files::{self, cannot_read, human_bytes};
 use crate::playable::FILE;
 use crate::run_folder::Run;
+use crate::sound;
 use crate::source::Source;
 use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, finish};
 use splat4d::layers::Scene;
@@ -68,10 +69,14 @@ fn complete_from(
     let meta = append_to(growing, run, chunked, true, deadline, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
     let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
+    let sound = first.run.as_ref().map_or(Ok(None), sound::of_run).unwrap_or_else(|e| {
+        console.warn(&format!("the sound is left out: {e}"));
+        None
+    });
     let mut source = files::open(growing)?;
     let mut length = 0;
     write_atomically_with(path, &mut |out| {
-        length = finish(&mut source, meta.clone(), poster.as_deref(), out)?;
+        length = finish(&mut source, meta.clone(), (poster.as_deref(), sound.as_ref()), out)?;
         Ok(())
     })?;
     console.written(path);

@@ -19,7 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// The file by which a capture is recognised.
 const CAPTURE: &str = "capture.json";
 /// Files that an import writes into its folder, in addition to its corrections.
-const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
+const WRITTEN: [&str; 6] = [CAPTURE, "points.ply", "images", "masks", "import", "sound.m4a"];
 /// Files by which a run is recognised.
 const RUN: [&str; 2] = ["recipe.toml", "run.json"];
 /// Findings of the doctor that the text contains; its page has all.

@@ -10,6 +10,7 @@ use crate::chunked;
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Origin, Run, check_written};
+use crate::sound;
 use crate::source::{Source, bundle, cloud, read_scene};
 use crate::{sequence, status};
 use serde_json::{Value, json};
@@ -228,6 +229,11 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
         line(&mut text, "training", &chunked::in_words(outlook));
     }
     let (mut troubles, mut listed) = (Vec::new(), Vec::new());
+    match sound::of_capture(path) {
+        Ok(Some(sound)) => line(&mut text, "sound", &sound::in_words(&sound)),
+        Ok(None) => {}
+        Err(e) => troubles.push(format!("Its sound cannot be used: {e}.")),
+    }
     let sentence = |f: &Finding| format!("{} {}", f.what, f.remedy).trim_end().to_owned();
     for finding in findings.iter().filter(|f| f.aspect.is_none()) {
         match finding.severity {
@@ -461,6 +467,9 @@ fn of_file(path: &Path) -> Result<Inspection> {
         for comment in info.comments.iter().take(4) {
             line(&mut text, "comment", comment);
         }
+    }
+    if let Some(own) = &source.sound {
+        line(&mut text, "sound", &sound::in_words(own));
     }
     let (doubts, notes): (Vec<&String>, Vec<&String>) =
         source.warnings.lines().iter().partition(|w| DOUBTS.iter().any(|d| w.contains(d)));

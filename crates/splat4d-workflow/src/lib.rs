@@ -32,6 +32,7 @@
 //! | `files.rs`, `deadline.rs` | files and numbers in words; the time that is left of `--minutes` |
 //! | `camera_file.rs`, `paths/` | camera files; orbits, data-set cameras and key-framed camera paths |
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
+//! | `sound.rs` | sound of captures, runs and files: converted, cut |
 //! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
 //! | `device.rs`, `draw.rs`, `video.rs`, `raw_values.rs`, `rendering.rs` | renders a scene's channels as images, films, arrays |
 //! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
@@ -97,6 +98,7 @@ pub mod rendering;
 pub mod report;
 pub mod run_folder;
 pub mod sequence;
+mod sound;
 pub mod source;
 pub mod status;
 pub mod still_baseline;

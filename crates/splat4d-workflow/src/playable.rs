@@ -44,7 +44,8 @@ impl Playable {
         let title = title(&source, path);
         let packed = pack(&source, &title, &Baking::default(), console)?;
         console.clear();
-        Ok(Self { title, content: Content::Bytes(packed.bytes.into()) })
+        let bytes = playback::with_extras(&packed.bytes, source.provenance.as_ref(), source.sound.as_ref())?;
+        Ok(Self { title, content: Content::Bytes(bytes.into()) })
     }
 
     /// The whole file. Errors: damaged anywhere.

@@ -10,6 +10,7 @@ use crate::source::{Source, not_empty};
 use crate::video::{self, Film};
 use crate::{camera_file, files};
 use splat4d::device::Device;
+use splat4d::format::playback::Sound;
 use splat4d::scene::Planes;
 use splat4d::{Error, Result, format};
 use splat4d_train::output::OutputFolder;
@@ -23,6 +24,9 @@ const FPS: f64 = 30.0;
 const PROBES: usize = 8;
 /// Range of a film in which nothing is to be seen, or of a channel that needs none.
 const NO_RANGE: [f32; 2] = [1.0, 2.0];
+
+/// Difference of two times that is rounding, seconds.
+const ROUNDING: f64 = 1e-6;
 
 /// Background of a scene: red, green, blue.
 pub type Color = [f32; 3];
@@ -254,7 +258,8 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
         files::make_folder(folder)?;
     }
     let owned = folders(args, &output, shots.len(), &sequence::Read { path, run: source.run.as_ref() })?;
-    let mut film = Film::create(&output, size, clock.fps, shots.len())?;
+    let sound = sound_of(&source, &shots, clock.fps, &output, console);
+    let mut film = Film::create(&output, size, clock.fps, shots.len(), sound)?;
     let mut drawing = Duration::ZERO;
     for (i, shot) in shots.iter().enumerate() {
         let start = Instant::now();
@@ -290,6 +295,31 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     ));
     console.written(&output);
     Ok(output)
+}
+
+/// The scene's sound, and the second at which the film begins; none where the film has none, which a line reports.
+fn sound_of<'a>(
+    source: &'a Source,
+    shots: &[paths::Shot],
+    fps: f64,
+    output: &Path,
+    console: &dyn Listener,
+) -> Option<(&'a Sound, f64)> {
+    let sound = source.sound.as_ref()?;
+    let (first, last) = (shots[0].time, shots[0].time + shots.len() as f64 / fps);
+    // A film that is stretched to whole frames is off by half of one at its end.
+    let runs = |(i, shot): (usize, &paths::Shot)| (shot.time - first - i as f64 / fps).abs() <= 0.5 / fps + ROUNDING;
+    let why = if !output.extension().is_some_and(|e| ["mp4", "mkv", "mov"].iter().any(|v| e.eq_ignore_ascii_case(v))) {
+        "this output holds images alone"
+    } else if !shots.iter().enumerate().all(runs) || shots.len() == 1 {
+        "time does not run at the scene's speed"
+    } else if sound.span[0] >= last || sound.span[1] <= first {
+        "there is none at these times"
+    } else {
+        return Some((sound, first));
+    };
+    console.result(&format!("the sound is left out: {why}"));
+    None
 }
 
 /// Takes the folders of frames: of images, where the output is not a single file, and of numbers.

@@ -7,7 +7,8 @@ use crate::files::{self, either};
 use crate::paths::{Stage, View};
 use crate::run_folder::{Run, check_written};
 use crate::sequence;
-use splat4d::format::playback::{self, Index, Kind, Provenance};
+use crate::sound;
+use splat4d::format::playback::{self, Index, Kind, Provenance, Sound};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
 use splat4d::layers::{Layer, Scene};
@@ -41,6 +42,8 @@ pub struct Source {
     pub playback: Option<Index>,
     /// Provenance of the playback file, if stated; copied into playback files made of it.
     pub provenance: Option<Provenance>,
+    /// What is heard, copied likewise.
+    pub sound: Option<Sound>,
     /// Name of a foreign format.
     pub dialect: Option<Dialect>,
     /// Warnings about parts that could not be read, or had to be assumed.
@@ -112,7 +115,8 @@ impl Source {
         if path.is_dir() {
             let run = Run::open(path)?;
             let scene = read_scene(&run.scene_file()?)?;
-            return Ok(Self { run: Some(run), ..Self::own(scene) });
+            let sound = sound::of_run(&run);
+            return Ok(Self { run: Some(run), ..Self::own(scene) }.with_sound(sound));
         }
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if path.file_name().is_some_and(|n| n == sog::META) {
@@ -131,7 +135,7 @@ impl Source {
             if index.sections.iter().any(|e| e.kind == Kind::Poster && !e.is_intact(&bytes)) {
                 source.warnings.add("the poster is damaged (its checksum is wrong), the scene is not: bake it again");
             }
-            return Ok(Self { playback: Some(index), ..source });
+            return Ok(Self { playback: Some(index), ..source }.with_sound(playback::sound(&bytes)));
         }
         if let Some(source) = bundle::open_archive(path, &bytes)? {
             return Ok(source);
@@ -190,7 +194,16 @@ impl Source {
     /// A scene of our own, without a run.
     pub fn own(scene: Scene<f32>) -> Self {
         let warnings = Warnings::default();
-        Self { scene, run: None, ply: None, playback: None, provenance: None, dialect: None, warnings }
+        Self { scene, run: None, ply: None, playback: None, provenance: None, sound: None, dialect: None, warnings }
+    }
+
+    /// The same with its sound. One that cannot be read is a warning: the scene is complete without it.
+    fn with_sound(mut self, sound: Result<Option<Sound>>) -> Self {
+        match sound {
+            Ok(sound) => self.sound = sound,
+            Err(e) => self.warnings.add(format!("the sound is left out: {e}")),
+        }
+        self
     }
 
     /// Refuses an output that would replace what was read.

@@ -2,6 +2,7 @@
 
 use crate::draw::Rgb;
 use crate::files::{self, cannot_write};
+use splat4d::format::playback::Sound;
 use splat4d::{Error, Result};
 use splat4d_train::output::Staged;
 use std::fs::File;
@@ -11,6 +12,9 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 
 /// x264's quality: 18 is visually lossless for most material (FFmpeg's H.264 guide).
 const CRF: &str = "18";
+/// Bits per second of its sound, and samples per second.
+const AUDIO: &str = "160k";
+const SAMPLES: f64 = 48_000.0;
 /// File name endings that films may have.
 const ENDINGS: &str =
     "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
@@ -36,6 +40,8 @@ pub enum Film {
         child: Child,
         /// Destination of frames.
         pipe: Option<ChildStdin>,
+        /// The file that ffmpeg reads sound from; removed with the film's maker.
+        sound: Option<Staged>,
         /// Collects what ffmpeg states.
         words: Option<std::thread::JoinHandle<Vec<u8>>>,
     },
@@ -57,12 +63,19 @@ pub enum Film {
 
 impl Film {
     /// Starts a film of `frames` frames at `path`: `.mp4`, `.mkv` and `.mov` through ffmpeg, `.png` and `.apng` as
-    /// animated PNG, no ending as a folder of numbered PNGs.
-    pub fn create(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> Result<Self> {
+    /// animated PNG, no ending as a folder of numbered PNGs. `sound`: sound of the first kind, and the scene's second at
+    /// which the film begins, from which on time runs as it does.
+    pub fn create(
+        path: &Path,
+        [width, height]: [usize; 2],
+        fps: f64,
+        frames: usize,
+        sound: Option<(&Sound, f64)>,
+    ) -> Result<Self> {
         let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         match ending.as_str() {
             "png" | "apng" => Self::apng(path, [width, height], fps, frames),
-            "mp4" | "mkv" | "mov" => Self::ffmpeg(path, &ending, [width, height], fps),
+            "mp4" | "mkv" | "mov" => Self::ffmpeg(path, &ending, [width, height], fps, frames, sound),
             "" => {
                 files::make_folder(path)?;
                 Ok(Self::Folder { path: path.to_owned(), next: 0 })
@@ -71,14 +84,34 @@ impl Film {
         }
     }
 
-    fn ffmpeg(path: &Path, ending: &str, [width, height]: [usize; 2], fps: f64) -> Result<Self> {
+    fn ffmpeg(
+        path: &Path,
+        ending: &str,
+        [width, height]: [usize; 2],
+        fps: f64,
+        frames: usize,
+        sound: Option<(&Sound, f64)>,
+    ) -> Result<Self> {
         let output = Staged::new(path)?;
         // ffmpeg would report an unwritable place only after the first frame, in its own words.
         File::create(output.path()).map_err(|e| cannot_write(path, e))?;
         let container = if ending == "mkv" { "matroska" } else { ending };
         let mut command = Command::new("ffmpeg");
         command.args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
-        command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "-", "-an"]);
+        command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "-"]);
+        let sound = sound.map(|(sound, begins)| Ok((heard(sound, path)?, sound.span[0] - begins))).transpose()?;
+        match &sound {
+            Some((file, late)) => {
+                command.arg("-i").arg(file.path()).args(["-map", "0:v", "-map", "1:a", "-c:a", "aac", "-b:a", AUDIO]);
+                // What the film begins after is left out; sound that begins later is preceded by silence.
+                let cut = format!("atrim=start={:.6},asetpts=PTS-STARTPTS", (-late).max(0.0));
+                let delay = format!("adelay=delays={:.0}S:all=1", late.max(0.0) * SAMPLES);
+                command.args(["-af", &format!("aresample={SAMPLES},{cut},{delay}")]);
+                command.args(["-t", &format!("{:.6}", frames as f64 / fps)]);
+            }
+            None => drop(command.arg("-an")),
+        }
+        let sound = sound.map(|(file, _)| file);
         // 4:2:0 needs even sides.
         command.args(["-vf", "crop=max(2\\,trunc(iw/2)*2):max(2\\,trunc(ih/2)*2)", "-c:v", "libx264", "-crf", CRF]);
         command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", container]).arg(output.path());
@@ -97,7 +130,7 @@ impl Film {
                 all
             })
         });
-        Ok(Self::Mp4 { output, child, pipe, words })
+        Ok(Self::Mp4 { output, child, pipe, sound, words })
     }
 
     fn apng(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> Result<Self> {
@@ -177,6 +210,13 @@ impl Film {
     }
 }
 
+/// The sound as a file next to the film, under a temporary name.
+fn heard(sound: &Sound, film: &Path) -> Result<Staged> {
+    let staged = Staged::new(&film.with_extension("sound.m4a"))?;
+    std::fs::write(staged.path(), &sound.mp4).map_err(|e| cannot_write(film, e))?;
+    Ok(staged)
+}
+
 /// An error of the PNG encoder: nearly always the disk.
 fn full(path: &Path, error: png::EncodingError) -> Error {
     match error {
@@ -212,7 +252,7 @@ mod tests {
     fn an_animated_png_holds_its_frames() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("film.png");
-        let mut film = Film::create(&path, [9, 5], 24.0, 3).unwrap();
+        let mut film = Film::create(&path, [9, 5], 24.0, 3, None).unwrap();
         for shade in [10, 90, 200] {
             film.frame(&picture(shade, 9, 5)).unwrap();
         }
@@ -232,7 +272,7 @@ mod tests {
     fn a_folder_holds_numbered_images() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("frames");
-        let mut film = Film::create(&path, [4, 4], 24.0, 2).unwrap();
+        let mut film = Film::create(&path, [4, 4], 24.0, 2, None).unwrap();
         film.frame(&picture(1, 4, 4)).unwrap();
         film.frame(&picture(2, 4, 4)).unwrap();
         film.finish().unwrap();
@@ -248,7 +288,7 @@ mod tests {
         }
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("film.mp4");
-        let mut film = Film::create(&path, [33, 17], 24.0, 4).unwrap();
+        let mut film = Film::create(&path, [33, 17], 24.0, 4, None).unwrap();
         for shade in 0..4 {
             film.frame(&picture(shade * 60, 33, 17)).unwrap();
         }
@@ -261,6 +301,6 @@ mod tests {
     fn unknown_endings_and_missing_folders_are_explained() {
         let message = check(Path::new("film.gif")).unwrap_err().to_string();
         assert!(message.contains(".gif") && message.contains(".mp4"));
-        assert!(Film::create(Path::new("/nonexistent/film.png"), [4, 4], 24.0, 2).is_err());
+        assert!(Film::create(Path::new("/nonexistent/film.png"), [4, 4], 24.0, 2, None).is_err());
     }
 }

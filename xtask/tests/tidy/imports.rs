@@ -114,6 +114,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "run_folder",
             "status",
             "sequence",
+            "sound",
             "source",
             "device",
             "draw",

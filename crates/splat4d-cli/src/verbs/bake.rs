@@ -4,7 +4,7 @@ use crate::console::Console;
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
-use splat4d_workflow::baking::{Baking, bake};
+use splat4d_workflow::baking::{Baking, SoundChoice, bake};
 use splat4d_workflow::files::parse_bytes;
 use std::path::PathBuf;
 
@@ -46,6 +46,9 @@ pub(crate) struct Args {
     /// Leave out the poster image that is shown during loading
     #[arg(long)]
     no_poster: bool,
+    /// Sound: none, or a file with a sound track, which begins with the clip [default: the capture's, or that of the file]
+    #[arg(long, value_name = "FILE|none")]
+    sound: Option<PathBuf>,
     /// Write settings and quality as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
@@ -69,6 +72,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         bytes: args.size,
         palette: args.palette,
         poster: !args.no_poster,
+        sound: match &args.sound {
+            None => SoundChoice::Kept,
+            Some(none) if none.as_os_str() == "none" => SoundChoice::None,
+            Some(file) => SoundChoice::File(file.clone()),
+        },
         ..Baking::default()
     };
     bake(&args.source, out, args.report.as_deref(), &baking, console)?;

@@ -3,7 +3,8 @@
 use crate::console::Console;
 use clap::builder::PossibleValuesParser;
 use splat4d::format::dialect;
-use splat4d::format::{DIALECTS, Linear, spz};
+use splat4d::format::dialect::WriteOptions;
+use splat4d::format::{DIALECTS, Linear};
 use splat4d_workflow::converting::{self, Conversion, written};
 use splat4d_workflow::files::either;
 use splat4d_workflow::programs::{PROGRAMS, Program};
@@ -85,7 +86,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "WHAT", value_enum)]
     linear: Vec<LinearValues>,
     /// Version of .spz to write: 3 for most programs, 2 for GaussianSplats3D and spz-js, 4 for PlayCanvas' engine
-    #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
+    #[arg(long, value_name = "V", default_value_t = WriteOptions::default().spz_version,
           value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
     /// Axes, unit and file names of this program; with --frames also --constant

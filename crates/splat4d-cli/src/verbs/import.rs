@@ -41,9 +41,13 @@ pub(crate) struct Args {
     /// Fixed or moving cameras; auto: one video is a moving camera, several are fixed ones
     #[arg(long, value_name = "auto|fixed|moving", default_value = "auto", value_parser = ["auto", "fixed", "moving"])]
     rig: String,
-    /// Do not use the videos' sound
+    /// Do not use the videos' sound, and keep none
     #[arg(long)]
     no_audio: bool,
+    /// Sound that the capture keeps: a camera, a file that is aligned with the cameras' sound, or none [default: of the
+    /// tracks that cover the clip, the loudest without clipping]
+    #[arg(long, value_name = "CAMERA|FILE|none")]
+    sound: Option<String>,
     /// Use the files' timestamps: one trigger drives all cameras
     #[arg(long)]
     synchronous: bool,
@@ -191,6 +195,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             _ => Rig::Auto,
         },
         sound: !args.no_audio,
+        track: args.sound.clone(),
         format: if args.png { Format::Png } else { Format::default() },
         apart: args.apart.clone(),
         board: args.board,

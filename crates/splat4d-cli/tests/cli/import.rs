@@ -1,6 +1,7 @@
 //! `import` on the bundled capture's images, without any other information.
 
 use crate::sample::splat4d;
+use crate::sound::{begins, decoded};
 use crate::{json_of, str};
 use serde_json::{Value, json};
 use splat4d::math::align::apart;
@@ -72,8 +73,21 @@ fn images_alone_become_a_capture_with_clocks_and_poses() {
 const SOUND_RATE: u32 = 16_000;
 const SLOW: usize = 10;
 
+/// Whether ffmpeg is there; without it a test is skipped, unless it is required.
+pub(crate) fn have_ffmpeg() -> bool {
+    let found = std::process::Command::new("ffmpeg").arg("-version").output().is_ok();
+    assert!(found || std::env::var_os("REQUIRE_FFMPEG").is_none(), "ffmpeg is missing");
+    if !found {
+        eprintln!("skipped: no ffmpeg");
+    }
+    found
+}
+
+/// How loud cameras record, of 32767: the second one is loud, the third one so much so that it clips.
+const LOUDNESS: [f64; 4] = [8_000.0, 20_000.0, 90_000.0, 20_000.0];
+
 /// A WAV file of a camera's sound that begins after this many seconds: bursts of noise, the same for all.
-fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
+pub(crate) fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
     let noise = |stream: u64, k: u64| {
         let mut z = (stream << 32 | k).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -89,7 +103,7 @@ fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
             let since = t - 0.23 * b as f64 - 0.07 * noise(7, b).abs();
             if (0.0..0.06).contains(&since) { (1.0 - since / 0.06) * noise(8, first + k) } else { 0.0 }
         });
-        ((own + burst.sum::<f64>()).clamp(-1.0, 1.0) * 20_000.0) as i16
+        ((own + burst.sum::<f64>()).clamp(-1.0, 1.0) * LOUDNESS[camera as usize]).clamp(-32_767.0, 32_767.0) as i16
     };
     let data: Vec<u8> = (0..(seconds * rate) as u64).flat_map(|k| sample(k).to_le_bytes()).collect();
     let mut out = b"RIFF".to_vec();
@@ -107,9 +121,7 @@ fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
 
 #[test]
 fn videos_with_sound_are_synchronised_by_sound() {
-    if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
-        assert!(std::env::var_os("REQUIRE_FFMPEG").is_none(), "ffmpeg is missing");
-        eprintln!("skipped: no ffmpeg");
+    if !have_ffmpeg() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
@@ -134,7 +146,10 @@ fn videos_with_sound_are_synchronised_by_sound() {
             .unwrap();
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     }
-    splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).args(&SMALL).run().ok();
+    let import = |more: &[&str]| {
+        splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).args(&SMALL).args(more).run()
+    };
+    let told = import(&[]).ok();
     let report = json_of(&take.join("import/report.json"));
     for (k, (name, begin)) in cameras.iter().enumerate() {
         let camera = &report["cameras"][k];
@@ -143,6 +158,29 @@ fn videos_with_sound_are_synchronised_by_sound() {
         let off = (camera["offset"].as_f64().unwrap() - report["cameras"][0]["offset"].as_f64().unwrap()) * SLOW as f64;
         assert!((off - *begin as f64).abs() < 0.2, "{name}: {off} frames, begun after {begin}");
     }
+    // The loudest camera that does not clip is kept, where it belongs on the clock of all: that of the first camera, which
+    // began with the world.
+    assert!(told.contains("The sound of camera cam07 is kept"), "{told}");
+    let zero = report["cameras"][0]["offset"].as_f64().unwrap();
+    let kept = || {
+        let own = &json_of(&take.join("capture.json"))["sound"];
+        let start = own["start"].as_f64().expect("it has sound") - zero;
+        (start, begins(&decoded(&take.join(own["file"].as_str().unwrap())), start))
+    };
+    let aligned = |(start, found): (f64, f64)| assert!((start - found).abs() < 0.01, "{start} s, heard at {found} s");
+    aligned(kept());
+    Capture::open(&take, &CaptureOptions::default()).unwrap();
+    assert!(splat4d(&["info", str(&take)]).run().all().contains("kbit/s"));
+    // Others on request: a camera, a recorder that began at another time, none.
+    assert!(import(&["--sound", "cam06"]).ok().contains("cam06 is kept, as requested"));
+    aligned(kept());
+    let recorder = dir.path().join("recorder.wav");
+    std::fs::write(&recorder, heard(0.13, 3.0, 3)).unwrap();
+    assert!(import(&["--sound", str(&recorder)]).ok().contains("aligned with that of"));
+    aligned(kept());
+    assert!(import(&["--sound", "cam99"]).refused().contains("cam06, cam07, cam08"));
+    import(&["--sound", "none"]).ok();
+    assert!(json_of(&take.join("capture.json")).get("sound").is_none() && !take.join("sound.m4a").exists());
 }
 
 /// The bundled cameras' numbers, as they are.

@@ -14,6 +14,7 @@ mod given;
 mod inputs;
 mod poses;
 mod report;
+mod soundtrack;
 mod spacing;
 mod stored;
 mod tags;
@@ -66,6 +67,8 @@ pub struct Request {
     pub rig: Rig,
     /// Whether sound is used.
     pub sound: bool,
+    /// Sound that is kept: a camera, a file, or `none`. None: that of the best camera, if `sound`.
+    pub track: Option<String>,
     /// How images are stored.
     pub format: Format,
     /// Two cameras and the metres between them.
@@ -102,6 +105,7 @@ impl Request {
             fps: FPS,
             rig: Rig::Auto,
             sound: true,
+            track: None,
             format: Format::default(),
             apart: None,
             board: None,
@@ -190,7 +194,16 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(interrupted());
     }
-    let found = Solution { stored: &stored, given, clicked, solved, evidence: &evidence, told: &told, moves };
+    let found = Solution {
+        cameras: &cameras,
+        stored: &stored,
+        given,
+        clicked,
+        solved,
+        evidence: &evidence,
+        told: &told,
+        moves,
+    };
     finish(request, found, &mut corrections, report, progress)
 }
 
@@ -339,6 +352,7 @@ fn material(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> b
 
 /// All that was found.
 struct Solution<'a> {
+    cameras: &'a [Camera],
     stored: &'a stored::Stored<'a>,
     given: Option<given::Given>,
     /// Floor and unit of clicked points.
@@ -544,7 +558,7 @@ fn finish(
     progress: &mut Progress<'_>,
 ) -> Result<Report> {
     let folder = &request.folder;
-    let Solution { stored, given, clicked, mut solved, evidence, told, moves } = found;
+    let Solution { cameras, stored, given, clicked, mut solved, evidence, told, moves } = found;
     let pictures = stored.pictures;
     let posed = given.as_ref().is_some_and(|g| g.posed);
     // COLMAP's own axes and unit are those of some camera.
@@ -612,7 +626,8 @@ fn finish(
         splat4d_train::run::checkpoint::write_atomically(&folder.join(&file), &bytes)?;
         points = Some(file);
     }
-    let take = Recording { name: None, up: Some(solved.up), points, ..Recording::default() };
+    let sound = soundtrack::keep(request, cameras, &solved, &placed, &mut report.guesses, progress)?;
+    let take = Recording { name: None, up: Some(solved.up), points, sound, ..Recording::default() };
     report.capture = write::capture(folder, &take, &placed)?;
     report.points = solved.points.len();
     report.write(folder)?;

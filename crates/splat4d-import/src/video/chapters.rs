@@ -150,6 +150,16 @@ impl Source for Joined {
         Ok(self.info.sound.then_some(out))
     }
 
+    fn sounds(&self) -> Vec<(PathBuf, Option<usize>, f64)> {
+        let end = |i: usize| self.starts.get(i + 1).copied().or(self.info.duration).unwrap_or(0.0);
+        let silence = (PathBuf::new(), None, 0.0);
+        let part = |(i, part): (usize, &Box<dyn Source>)| {
+            let (path, stream, _) = part.sounds().pop().unwrap_or(silence.clone());
+            (path, stream, end(i) - self.starts[i])
+        };
+        if self.info.sound { self.parts.iter().enumerate().map(part).collect() } else { Vec::new() }
+    }
+
     fn fingerprint(&self) -> Result<String> {
         let prints = self.parts.iter().map(|p| p.fingerprint()).collect::<Result<Vec<_>>>()?;
         Ok(format!("{:016x}", fnv1a(prints.concat().as_bytes())))

@@ -102,37 +102,46 @@ impl Source for Video {
     }
 
     fn sound(&self) -> Result<Option<Vec<f32>>> {
-        let Some(stream) = self.probe.sound else { return Ok(None) };
-        // Sound that begins later than the images is preceded by silence; gaps are filled with it.
-        let filter = format!("aresample={SOUND_RATE}:async=1:first_pts=0");
-        let output = ["-map", &format!("0:{stream}"), "-vn", "-af", &filter, "-ac", "1", "-t", &MAX_SOUND.to_string()];
-        let mut output: Vec<String> = output.map(String::from).to_vec();
-        output.extend(["-f", "f32le"].map(String::from));
-        let mut running = self.tools.start(&self.path, &[], &output)?;
-        let mut samples = Vec::new();
-        let mut buffer = vec![0; 1 << 16];
-        loop {
-            let filled = running.fill(&mut buffer);
-            let whole = buffer[..filled].chunks_exact(4);
-            samples.extend(whole.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
-            if filled < buffer.len() {
-                break;
-            }
-        }
-        let (well, said) = running.finish();
-        if samples.is_empty() && !well {
-            let what = format!("its sound cannot be decoded{}", said.bracketed());
-            return Err(Error::input(what).at(self.path.display()).remedy("Synchronise without its sound."));
-        }
-        // Damaged files hold what is not finite.
-        samples.iter_mut().filter(|s| !s.is_finite()).for_each(|s| *s = 0.0);
-        Ok((!samples.is_empty()).then_some(samples))
+        self.probe.sound.map_or(Ok(None), |stream| samples(&self.tools, &self.path, stream))
+    }
+
+    fn sounds(&self) -> Vec<(PathBuf, Option<usize>, f64)> {
+        let part = |stream| (self.path.clone(), Some(stream), f64::INFINITY);
+        self.probe.sound.map(part).into_iter().collect()
     }
 
     fn fingerprint(&self) -> Result<String> {
         let hash = fingerprint_of_file(&self.path)?;
         Ok(format!("{:016x}", fnv1a(&hash.to_le_bytes())))
     }
+}
+
+/// Samples of a sound stream, see [`Source::sound`].
+pub(crate) fn samples(tools: &Tools, path: &Path, stream: usize) -> Result<Option<Vec<f32>>> {
+    // Sound that begins later than the images is preceded by silence; gaps are filled with it.
+    let filter = format!("aresample={SOUND_RATE}:async=1:first_pts=0");
+    let output = ["-map", &format!("0:{stream}"), "-vn", "-af", &filter, "-ac", "1", "-t", &MAX_SOUND.to_string()];
+    let mut output: Vec<String> = output.map(String::from).to_vec();
+    output.extend(["-f", "f32le"].map(String::from));
+    let mut running = tools.start(path, &[], &output)?;
+    let mut samples = Vec::new();
+    let mut buffer = vec![0; 1 << 16];
+    loop {
+        let filled = running.fill(&mut buffer);
+        let whole = buffer[..filled].chunks_exact(4);
+        samples.extend(whole.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+        if filled < buffer.len() {
+            break;
+        }
+    }
+    let (well, said) = running.finish();
+    if samples.is_empty() && !well {
+        let what = format!("its sound cannot be decoded{}", said.bracketed());
+        return Err(Error::input(what).at(path.display()).remedy("Synchronise without its sound."));
+    }
+    // Damaged files hold what is not finite.
+    samples.iter_mut().filter(|s| !s.is_finite()).for_each(|s| *s = 0.0);
+    Ok((!samples.is_empty()).then_some(samples))
 }
 
 /// The frames of a video as ffmpeg gives them.

@@ -13,20 +13,24 @@ mod filters;
 mod folder;
 mod probe;
 mod program;
+mod soundtrack;
 
 pub(crate) use chapters::{Chapter, open_all};
 pub(crate) use clock::mean_difference;
 pub use clock::{Clock, Gap};
 pub(crate) use crop::without_bars;
 pub use crop::{Crop, Cropping};
+pub(crate) use ffmpeg::samples;
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub(crate) use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
 pub use program::Tools;
+pub(crate) use soundtrack::encode;
+pub use soundtrack::write_sound;
 pub use splat4d_train::capture::Rgb8;
 
 use splat4d::{Error, ErrorKind, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above
 /// twice the highest frequency that sound is compared at.
@@ -158,6 +162,12 @@ pub trait Source: Send + Sync {
     /// Its sound as one channel at `SOUND_RATE`; the first sample at second 0 of the clock that frames have. None where
     /// there is none.
     fn sound(&self) -> Result<Option<Vec<f32>>>;
+
+    /// Where its sound is: files one after the other from second 0 of its clock on, each with the number of the stream
+    /// (none: it is silent) and its length, seconds. Empty where there is none.
+    fn sounds(&self) -> Vec<(PathBuf, Option<usize>, f64)> {
+        Vec::new()
+    }
 
     /// Fingerprint of the content: 16 hexadecimal digits.
     fn fingerprint(&self) -> Result<String>;

@@ -105,6 +105,34 @@ impl Tools {
         Ok(String::from_utf8_lossy(&out.stdout).into_owned())
     }
 
+    /// Number of a file's first sound stream. Errors: an unsupported file, one without sound.
+    pub(crate) fn sound_stream(&self, path: &Path) -> Result<usize> {
+        let text = self.probe(path)?;
+        let of = |top: serde_json::Value| {
+            let streams = top["streams"].as_array()?.iter();
+            streams.clone().find(|s| s["codec_type"] == "audio")?["index"].as_u64()
+        };
+        serde_json::from_str(&text).ok().and_then(of).map(|index| index as usize).ok_or_else(|| {
+            Error::input("there is no sound in it").at(path.display()).remedy("Give a file with a sound track.")
+        })
+    }
+
+    /// Runs ffmpeg, which writes the file `out`. Errors: it cannot be started, or fails.
+    pub(super) fn write(&self, arguments: &[OsString], out: &Path) -> Result<()> {
+        let mut command = Command::new(&self.ffmpeg);
+        command.args(["-hide_banner", "-nostats", "-nostdin", "-loglevel", "error", "-y"]).args(arguments);
+        let ran = command.arg(file(out)).stdin(Stdio::null()).output();
+        let ran = ran.map_err(|e| Error::environment("ffmpeg cannot be started", e).remedy(INSTALL))?;
+        if ran.status.success() {
+            return Ok(());
+        }
+        let said = String::from_utf8_lossy(&ran.stderr);
+        let last = said.lines().map(|l| plain(l, out)).rfind(|l| !l.is_empty()).unwrap_or_default();
+        Err(Error::environment("ffmpeg could not write the sound", std::io::Error::other(last))
+            .at(out.display())
+            .remedy("Check that there is space, and that the file plays."))
+    }
+
     /// Starts ffmpeg on a file; `input` is before the file's name, `output` behind it, and what it makes comes through
     /// a pipe.
     pub(super) fn start(&self, path: &Path, input: &[String], output: &[String]) -> Result<Running> {
@@ -151,7 +179,7 @@ impl Tools {
 }
 
 /// A file as ffmpeg takes it: whatever its name begins with, it is neither an option nor an address.
-fn file(path: &Path) -> OsString {
+pub(super) fn file(path: &Path) -> OsString {
     let mut name = OsString::from("file:");
     name.push(path);
     name

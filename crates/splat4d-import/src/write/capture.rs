@@ -47,6 +47,8 @@ pub struct Recording {
     pub up: Option<[f64; 3]>,
     /// The initial cloud, from the folder on.
     pub points: Option<PathBuf>,
+    /// The file of its sound, from the folder on, and the second at which it begins.
+    pub sound: Option<(PathBuf, f64)>,
     /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with
     /// care.
     pub hold_out: Vec<String>,
@@ -79,6 +81,10 @@ pub fn capture(folder: &Path, take: &Recording, cameras: &[Placed]) -> Result<Pa
     }
     if let Some(points) = &take.points {
         set("points", json!(points.to_string_lossy().replace('\\', "/")));
+    }
+    if let Some((file, start)) = &take.sound {
+        let start = (start * TICKS).round() / TICKS;
+        set("sound", json!({"file": file.to_string_lossy().replace('\\', "/"), "start": start}));
     }
     let is_rig = cameras.len() > 1 && cameras.iter().all(|c| matches!(c.poses, Poses::Fixed(_)));
     if !take.hold_out.is_empty() {

@@ -48,7 +48,9 @@ import { Splat4D as BabylonObject } from 'splat4d/babylon';
 const element: Splat4D = document.createElement('splat-4d');
 const camera: CameraState = element.camera;
 element.addEventListener('timeupdate', (event) => event.detail.time.toFixed(1));
-const object = new ThreeObject('knight.s4d', { up: 'z' });
+element.volume = element.muted ? 0.5 : 1;
+const object = new ThreeObject('knight.s4d', { up: 'z', sound: true });
+if (object.sound?.there && object.sound.blocked) object.sound.touched();
 object.position.set(0, object.duration, camera.fov);
 export default [Same, ReactElement, Frames, SETTINGS, SparkObject, PlayCanvasObject, BabylonObject];
 // @ts-expect-error: there is no such axis

@@ -29,6 +29,7 @@ const TOP_KEYS: &[&str] = &[
     "background",
     "up",
     "labels",
+    "sound",
     "depth_kind",
     "depth_scale",
     "comment",
@@ -119,6 +120,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
     lookup.report(&mut account);
     let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
     let points = top.opt("points")?.map(|n| lookup.file(n.text()?)).transpose()?;
+    let sound = top.opt("sound")?.map(|n| read_sound(root, &n)).transpose()?;
     Ok(RawCapture {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         cameras,
@@ -129,7 +131,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
         hold_out,
         fps,
         points: points.as_deref().map(read_cloud).transpose()?,
-        files: points.into_iter().collect(),
+        files: points.into_iter().chain(sound).collect(),
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
@@ -158,6 +160,13 @@ fn in_part(top: &Node<'_>, nodes: &[Node<'_>], stated: Option<&HoldOut>, options
         }
     }
     Ok(true)
+}
+
+/// The file of the sound. Training does not use it, so that it may be missing.
+fn read_sound(root: &Path, node: &Node<'_>) -> Result<PathBuf> {
+    node.only(&["file", "start"])?;
+    node.opt("start")?.map(|n| n.number()).transpose()?;
+    Ok(root.join(node.get("file")?.text()?))
 }
 
 /// Names of labels, that of mask value 0 first.

@@ -46,7 +46,7 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
     for (i, e) in sections.iter().enumerate().take(LISTED) {
         let (tier, span) = match e.kind {
             Kind::Page => (e.tier.to_string(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
-            Kind::Masks => (String::new(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
+            Kind::Masks | Kind::Sound => (String::new(), format!("{:.3} to {:.3}", e.span[0], e.span[1])),
             _ => (String::new(), String::new()),
         };
         let (count, bytes) = (grouped(e.count as usize), grouped(e.stored as usize));
@@ -55,10 +55,11 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
     if sections.len() > LISTED {
         line(&mut text, "", &format!("and {} more", grouped(sections.len() - LISTED)));
     }
-    let sizes = [Kind::Page, Kind::Palette, Kind::Poster, Kind::Masks, Kind::Labels].map(|kind| (kind, stored(kind)));
+    let sizes = [Kind::Page, Kind::Palette, Kind::Poster, Kind::Masks, Kind::Labels, Kind::Sound]
+        .map(|kind| (kind, stored(kind)));
     let head = index.file_len.saturating_sub(known);
     let parts =
-        ["pages", "palettes", "poster", "masks", "labels"].iter().zip(&sizes).map(|(name, (_, bytes))| (*name, *bytes));
+        ["pages", "palettes", "poster", "masks", "labels", "sound"].iter().zip(&sizes).map(|(n, (_, b))| (*n, *b));
     let parts: Vec<String> = parts
         .chain([("index", head)])
         .filter(|(_, bytes)| *bytes > 0)
@@ -77,7 +78,8 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
     }
     let json = json!({
         "version": index.version, "meta": meta, "sections": sections.iter().map(section).collect::<Vec<_>>(),
-        "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "mask_bytes": sizes[3].1, "index_bytes": head,
+        "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "mask_bytes": sizes[3].1,
+        "sound_bytes": sizes[5].1, "index_bytes": head,
         "first_picture_bytes": first_picture(index), "megabits_per_second": rate,
         "moments": moments.iter().map(|m| json!({"time": m.time, "gaussians": m.gaussians, "pages": m.pages,
             "bytes": m.bytes})).collect::<Vec<_>>(),
@@ -121,6 +123,9 @@ fn section(e: &Entry) -> Value {
         v["gaussians"] = json!(e.count);
         v["span"] = json!(e.span);
         v["page"] = json!(e.page);
+    }
+    if e.kind == Kind::Sound {
+        v["span"] = json!(e.span);
     }
     if e.kind == Kind::Labels {
         v["gaussians"] = json!(e.count);

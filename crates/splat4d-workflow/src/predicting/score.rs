@@ -181,7 +181,7 @@ impl Views {
             let file: String = name.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
             let path = folder.join(format!("film-{file}.{}", if have_ffmpeg() { "mp4" } else { "png" }));
             let fps = work.clock.fps.min(30.0);
-            let mut film = Film::create(&path, [2 * size.width, size.height], fps, shots.len())?;
+            let mut film = Film::create(&path, [2 * size.width, size.height], fps, shots.len(), None)?;
             for (i, shot) in shots.iter().enumerate() {
                 unless_stopped(stop)?;
                 console.phase("filming", i, shots.len());

@@ -20,7 +20,7 @@ pub const Y_DOWN: [f64; 3] = [0.0, -1.0, 0.0];
 pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
 
 /// Version of .spz that is written by default: the one that most programs open.
-pub const SPZ_VERSION: u32 = 3;
+pub(crate) const SPZ_VERSION: u32 = 3;
 
 /// Files of Gaussians that other programs share. docs/formats.md lists what each holds and assumes.
 #[derive(Clone, Copy)]

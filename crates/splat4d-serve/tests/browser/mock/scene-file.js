@@ -46,6 +46,7 @@ export class SceneFile {
   }
 
   async poster() { return null; }
+  async sound() { return globalThis.mockSound ?? null; }
   activePages(t) { return this.pages.filter(p => p.from <= t && t < p.to); }
   close() {}
 }

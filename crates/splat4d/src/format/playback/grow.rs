@@ -4,7 +4,7 @@
 
 use super::index::broken;
 use super::write::GENERATOR;
-use super::{Entry, GROWING, HEADER_BYTES, Index, Kind, Meta};
+use super::{Entry, GROWING, HEADER_BYTES, Index, Kind, Meta, Sound};
 use crate::{Error, Result};
 use std::io::{Read, Seek, SeekFrom, Write};
 
@@ -112,10 +112,15 @@ impl<F: Read + Write + Seek> Growing<F> {
 
 /// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player needs
 /// them, whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in
-/// [`write()`](super::write()). Returns the file's length, bytes.
+/// [`write()`](super::write()); `sound` comes last. Returns the file's length, bytes.
 ///
 /// Errors: `source` does not grow, or is damaged or cut short; metadata out of range; either file's.
-pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>, out: &mut dyn Write) -> Result<u64> {
+pub fn finish(
+    source: &mut (impl Read + Seek),
+    meta: Meta,
+    (poster, sound): (Option<&[u8]>, Option<&Sound>),
+    out: &mut dyn Write,
+) -> Result<u64> {
     meta.check()?;
     let grown = read_index(source)?;
     let order = order(&grown);
@@ -128,6 +133,8 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
         let [palette, page] = [e.palette, e.page].map(|p| p.map(|p| places[p as usize]));
         sections.push(Entry { palette, page, ..e.clone() });
     }
+    let sound = sound.map(Sound::section).transpose()?;
+    sections.extend(sound.iter().map(|(entry, _)| entry.clone()));
     let meta = Meta { gaussians: grown.meta.gaussians, parts: Vec::new(), missing: Vec::new(), ..meta };
     let mut index = Index { version: [0; 2], file_len: 0, meta, sections };
     index.version = index.least_version();
@@ -146,6 +153,7 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
             left -= buffer.len();
         }
     }
+    sound.map_or(Ok(()), |(_, mp4)| out.write_all(&mp4)).map_err(unwritten)?;
     Ok(index.file_len)
 }
 

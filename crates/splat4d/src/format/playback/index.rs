@@ -22,6 +22,9 @@ pub(super) const NO_PALETTE: u32 = u32::MAX;
 /// Bytes of masks before their key times, and most of these (docs/format.md, "Masks").
 pub(super) const MASK_HEAD: usize = 8;
 pub(super) const MAX_KEYS: usize = 65_535;
+/// Most bytes of sound (docs/format.md, "Sound"): an hour at 128 kbit/s; and most seconds, a day: more is damage.
+pub(super) const MOST_SOUND: usize = 64 << 20;
+pub(super) const MOST_SECONDS: f64 = 86_400.0;
 /// Flag of an entry: readers that do not support the kind refuse the file.
 const REQUIRED: u32 = 1;
 
@@ -42,6 +45,8 @@ pub enum Kind {
     Poster,
     /// The file's provenance.
     Provenance,
+    /// What is heard.
+    Sound,
     /// Something newer, which is skipped.
     Other([u8; 4]),
 }
@@ -56,14 +61,15 @@ impl Kind {
             Kind::Features => *b"FEAT",
             Kind::Poster => *b"POST",
             Kind::Provenance => *b"PROV",
+            Kind::Sound => *b"SOUN",
             Kind::Other(tag) => tag,
         }
     }
 
     fn of(tag: [u8; 4]) -> Self {
-        let known =
-            [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Features, Kind::Poster, Kind::Provenance];
-        known.into_iter().find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
+        let of_pages = [Kind::Page, Kind::Palette, Kind::Masks, Kind::Labels, Kind::Features];
+        let mut known = of_pages.into_iter().chain([Kind::Poster, Kind::Provenance, Kind::Sound]);
+        known.find(|k| k.tag() == tag).unwrap_or(Kind::Other(tag))
     }
 
     /// The four characters that the file has, others as dots.
@@ -116,7 +122,7 @@ pub struct Entry {
     pub degree: u16,
     /// Page: Gaussians. Palette: entries. Masks, labels, features: Gaussians of their page.
     pub count: u32,
-    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time.
+    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time. Sound: its first and last second.
     pub span: [f64; 2],
     /// Page: position of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
@@ -153,7 +159,7 @@ impl Index {
     /// [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
-    pub fn needed(prefix: &[u8]) -> Result<usize> {
+    pub(crate) fn needed(prefix: &[u8]) -> Result<usize> {
         if prefix.len() < HEADER_BYTES {
             let known = prefix.len().min(MAGIC.len());
             return if prefix[..known] == MAGIC[..known] { Ok(HEADER_BYTES) } else { Err(foreign()) };
@@ -476,7 +482,7 @@ impl Entry {
     }
 
     /// Checks that the fields of an entry of a known kind fit together.
-    fn check(&self, words: usize) -> Result<()> {
+    pub(super) fn check(&self, words: usize) -> Result<()> {
         let most = match self.codec {
             Codec::Raw => u64::from(self.stored),
             Codec::Deflate => u64::from(self.stored) * MAX_DEFLATE,
@@ -530,6 +536,18 @@ impl Entry {
                 let fits = bytes.is_multiple_of(count.max(1)) && (1..=MOST_CHANNELS).contains(&(bytes / count.max(1)));
                 if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || !fits {
                     return Err(broken(format!("features of {count} Gaussians do not have {bytes} bytes")));
+                }
+            }
+            Kind::Sound => {
+                let [from, to] = self.span;
+                if self.codec != Codec::Raw || self.bytes != self.stored || self.bytes as usize > MOST_SOUND {
+                    return Err(broken(format!(
+                        "sound of {} bytes, expected at most {MOST_SOUND} raw ones",
+                        self.stored
+                    )));
+                }
+                if !(from.is_finite() && to.is_finite() && from < to && to - from <= MOST_SECONDS) {
+                    return Err(broken(format!("sound cannot be played from {from} to {to} s")));
                 }
             }
             Kind::Poster | Kind::Provenance | Kind::Other(_) => {}

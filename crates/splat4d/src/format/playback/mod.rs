@@ -22,6 +22,7 @@ mod pages;
 mod palette;
 mod provenance;
 mod read;
+mod sound;
 mod strict;
 #[cfg(test)]
 mod tests;
@@ -41,8 +42,13 @@ pub(crate) use page::{Page, decode_page};
 pub use pages::{Pages, PagesDraft, read_pages, write_pages};
 pub use palette::Palette;
 pub(crate) use palette::decode_palette;
-pub use provenance::{Provenance, provenance, with_provenance};
+#[cfg(test)]
+use provenance::with_provenance;
+pub use provenance::{Provenance, provenance};
 pub use read::read;
+#[cfg(test)]
+use sound::with_sound;
+pub use sound::{Sound, sound, with_extras};
 pub use strict::strict;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 

@@ -47,10 +47,23 @@ pub fn provenance(bytes: &[u8]) -> Result<Option<Provenance>> {
     serde_json::from_slice(stored).map(Some).map_err(wrong)
 }
 
-/// The same file with this provenance in place of its own, or without any; all other sections keep their bytes.
+/// With this provenance alone.
+pub(super) fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>> {
+    let section = new.map(|new| {
+        let json = serde_json::to_vec(new).expect("plain texts are JSON");
+        if json.len() > MOST_BYTES {
+            return Err(Error::input(format!("{} bytes of provenance", json.len()))
+                .remedy(format!("A file holds {MOST_BYTES}: shorten the words, or leave the edits out")));
+        }
+        Ok((Entry::plain(Kind::Provenance, &json), json))
+    });
+    with_section(bytes, Kind::Provenance, section.transpose()?)
+}
+
+/// The same file with this section in place of its own of the kind, or without any; all other sections keep their bytes.
 ///
-/// Errors: not a playback file, a file that is cut short, more than a mebibyte of provenance.
-pub fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>> {
+/// Errors: not a playback file, a file that is cut short.
+pub(super) fn with_section(bytes: &[u8], kind: Kind, new: Option<(Entry, Vec<u8>)>) -> Result<Vec<u8>> {
     let mut index = Index::parse(bytes, Some(bytes.len() as u64))?;
     if index.file_len > bytes.len() as u64 {
         return Err(broken("it is cut short".into()));
@@ -62,12 +75,12 @@ pub fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>
         .iter()
         .scan(0, |next, e| {
             let place = *next;
-            *next += u32::from(e.kind != Kind::Provenance);
+            *next += u32::from(e.kind != kind);
             Some(place)
         })
         .collect();
     index.sections.retain_mut(|e| {
-        if e.kind == Kind::Provenance {
+        if e.kind == kind {
             return false;
         }
         parts.push(bytes[e.offset as usize..(e.offset + u64::from(e.stored)) as usize].to_vec());
@@ -75,14 +88,9 @@ pub fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>
         e.page = e.page.map(|p| places[p as usize]);
         true
     });
-    if let Some(new) = new {
-        let json = serde_json::to_vec(new).expect("plain texts are JSON");
-        if json.len() > MOST_BYTES {
-            return Err(Error::input(format!("{} bytes of provenance", json.len()))
-                .remedy(format!("A file holds {MOST_BYTES}: shorten the words, or leave the edits out")));
-        }
-        index.sections.push(Entry::plain(Kind::Provenance, &json));
-        parts.push(json);
+    if let Some((entry, body)) = new {
+        index.sections.push(entry);
+        parts.push(body);
     }
     let mut out = index.bytes(GENERATOR);
     parts.iter().for_each(|p| out.extend_from_slice(p));

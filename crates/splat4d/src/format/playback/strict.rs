@@ -2,7 +2,7 @@
 
 use super::index::{broken, raw_entry};
 use super::page::{Header, at, seen_widths};
-use super::{BLOCK_GAUSSIANS, Codec, Index, Kind, Page, VERSION, decode_page, provenance, read};
+use super::{BLOCK_GAUSSIANS, Codec, Index, Kind, Page, VERSION, decode_page, provenance, read, sound};
 use crate::Result;
 
 /// Bits of words that no field has, by word.
@@ -28,10 +28,11 @@ const IMAGES: [&[u8]; 2] = [b"\xFF\xD8\xFF", b"\x89PNG\r\n\x1a\n"];
 
 /// How a file deviates from docs/format.md although readers accept it; empty: not at all.
 ///
-/// Errors: what [`read`] refuses, and provenance that is damaged.
+/// Errors: what [`read`] refuses, and provenance or sound that is damaged.
 pub fn strict(bytes: &[u8]) -> Result<Vec<String>> {
     read(bytes)?;
     provenance(bytes)?;
+    sound(bytes)?;
     let index = Index::parse(bytes, Some(bytes.len() as u64))?;
     let mut out = Vec::new();
     of_header(bytes, &index, &mut out);
@@ -113,8 +114,8 @@ fn of_section(bytes: &[u8], index: &Index, i: usize, out: &mut Vec<String>) -> R
             out.push("the poster is neither JPEG nor PNG".into());
         }
         Kind::Masks if entry.page != before => out.push("masks do not follow their page".into()),
-        Kind::Provenance if index.sections[..i].iter().any(|e| e.kind == Kind::Provenance) => {
-            out.push("a second provenance".into());
+        Kind::Provenance | Kind::Sound if index.sections[..i].iter().any(|e| e.kind == entry.kind) => {
+            out.push(format!("a second `{name}`"));
         }
         Kind::Page => of_page(&decode_page(entry, body)?, out),
         _ => {}

@@ -7,6 +7,7 @@ mod grow;
 mod hostile;
 mod labels;
 mod masks;
+mod sound;
 
 use super::block::encode_page;
 use super::index::crc;

@@ -16,7 +16,6 @@ mod streams;
 mod tests;
 
 use super::bytes::sound_rows;
-pub use super::dialect::SPZ_VERSION as DEFAULT_VERSION;
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;

@@ -62,7 +62,7 @@ fn the_finished_file_does_not_depend_on_the_order_of_chunks() {
             added(&mut growing, &parts[i], meta(1.0, &["x"])).unwrap();
         }
         let mut out = Vec::new();
-        let length = finish(growing.file(), meta(1.0, &["x"]), Some(b"poster"), &mut out).unwrap();
+        let length = finish(growing.file(), meta(1.0, &["x"]), (Some(b"poster"), None), &mut out).unwrap();
         assert_eq!(length, out.len() as u64);
         out
     };
@@ -78,7 +78,7 @@ fn the_finished_file_does_not_depend_on_the_order_of_chunks() {
     }
     let mut cut = one.clone();
     cut.truncate(one.len() - 5);
-    assert!(finish(&mut Cursor::new(cut), meta(1.0, &[]), None, &mut Vec::new()).is_err());
+    assert!(finish(&mut Cursor::new(cut), meta(1.0, &[]), (None, None), &mut Vec::new()).is_err());
 }
 
 /// A disk with this many bytes.

@@ -54,6 +54,7 @@ pub(super) fn survive(bytes: &[u8]) -> bool {
                 drop(super::super::features::decode(e, body, &[[0.0, 1.0]; 3], &mut params));
             }
             Kind::Provenance => drop(provenance(bytes)),
+            Kind::Sound => drop(sound(bytes)),
             Kind::Poster | Kind::Other(_) => {}
         }
     }
