@@ -93,7 +93,7 @@ pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
         if t == 0 {
             let training = (0..CAMERAS).filter(|c| !HELD_OUT.contains(c));
             let training: Vec<_> = training.map(|c| (&cameras[c], &seen[c], views[c].rgb.as_slice())).collect();
-            write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&frame, &training)))?;
+            write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&frame, &training, truth::CLOUD)))?;
         }
         Ok((views, points))
     };

@@ -106,7 +106,7 @@ pub(crate) fn command(seconds: &str, folder: &Path, options: &[String]) -> Resul
         .collect();
     let training = (0..wish.cameras).filter(|&c| !wish.held_out(c));
     let training: Vec<_> = training.map(|c| (&cameras[c], &seen[c].0, seen[c].1.as_slice())).collect();
-    write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&hall, &training)))?;
+    write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&hall, &training, truth::CLOUD)))?;
     let entry = |camera: &Camera| {
         json!({
             "name": camera.name, "width": width, "height": height,

@@ -20,10 +20,8 @@ pub(crate) const FLOW_SCALE: f64 = 64.0;
 pub(crate) const TRACKS: usize = 200;
 /// A vertex counts as seen when it is at most this far behind what its pixel shows, scene units.
 const SEEN_TOLERANCE: f64 = 0.03;
-/// Points of the sparse cloud.
-const CLOUD_POINTS: usize = 3000;
-/// Standard deviation of the cloud's noise per axis, scene units.
-const CLOUD_NOISE: f64 = 0.005;
+/// The sparse cloud of a rig: what structure from motion finds of a few views that are far apart.
+pub(crate) const CLOUD: Cloud = Cloud { count: 3000, noise: 0.005 };
 /// Cameras that must see a point of the cloud or of a track in the first frame.
 const CLOUD_VIEWS: usize = 3;
 
@@ -126,16 +124,28 @@ fn is_seen(camera: &Camera, seen: &Visibility, point: V3) -> bool {
     inverse * (depth - SEEN_TOLERANCE) <= 1.0
 }
 
+/// What a sparse cloud is like.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Cloud {
+    pub count: usize,
+    /// Standard deviation of the noise per axis, scene units.
+    pub noise: f64,
+}
+
 /// A point of the sparse cloud: position and sRGB colour.
 pub(crate) type CloudPoint = ([f32; 3], [u8; 3]);
 
 /// Replaces structure from motion: random pixels of the first frame, kept when enough cameras see the point, with
 /// noise. `views` are the training cameras with what they see and their images.
-pub(crate) fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> Vec<CloudPoint> {
-    let mut cloud = Vec::with_capacity(CLOUD_POINTS);
+pub(crate) fn sparse_cloud(
+    frame: &Frame,
+    views: &[(&Camera, &Visibility, &[u8])],
+    Cloud { count, noise }: Cloud,
+) -> Vec<CloudPoint> {
+    let mut cloud = Vec::with_capacity(count);
     let mut caches: Vec<EdgeCache> = views.iter().map(|_| EdgeCache::default()).collect();
     let mut draw = 0;
-    while cloud.len() < CLOUD_POINTS {
+    while cloud.len() < count {
         let random = |k: i64| hash01(draw, k);
         let view = (random(0) * views.len() as f64) as usize;
         let (camera, seen, rgb) = views[view];
@@ -148,7 +158,7 @@ pub(crate) fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])
             let point = point_at(&frame.mesh, frame.mesh.triangles[index as usize].vertices, weights);
             if views.iter().filter(|(camera, seen, _)| is_seen(camera, seen, point)).count() >= CLOUD_VIEWS {
                 // Twelve uniform numbers minus six have variance 1 and nearly a normal distribution.
-                let noise = |axis: i64| ((0..12).map(|i| random(10 + 12 * axis + i)).sum::<f64>() - 6.0) * CLOUD_NOISE;
+                let noise = |axis: i64| ((0..12).map(|i| random(10 + 12 * axis + i)).sum::<f64>() - 6.0) * noise;
                 let p = point.array();
                 let at = 3 * (y * camera.width + x);
                 let position = std::array::from_fn(|i| (p[i] + noise(i as i64)) as f32);

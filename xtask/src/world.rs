@@ -59,7 +59,7 @@ pub(crate) fn command(name: &str, folder: &Path, maps: bool) -> Result<()> {
         if t == 0 {
             let training = (0..CAMERAS).filter(|c| *c != HELD_OUT);
             let training: Vec<_> = training.map(|c| (&cameras[c], &seen[c], pictures[c].as_slice())).collect();
-            write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&frame, &training)))?;
+            write_file(&folder.join("points.ply"), &truth::ply(&truth::sparse_cloud(&frame, &training, truth::CLOUD)))?;
         }
     }
     write_truth(folder, &world)?;
