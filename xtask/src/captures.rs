@@ -2,7 +2,7 @@
 
 use crate::capture::{self, CAMERAS};
 use crate::scene::FRAMES;
-use crate::{long, still, videos, world, yard};
+use crate::{long, photos, still, videos, world};
 use anyhow::{Context, Result, bail};
 use std::path::Path;
 
@@ -31,7 +31,7 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
             capture::write(&home, Path::new(folder), true)
         }
         [flag, seconds, folder, options @ ..] if flag == "--long" => long::command(seconds, Path::new(folder), options),
-        [flag, views, folder, options @ ..] if flag == "--photos" => yard::command(views, Path::new(folder), options),
+        [flag, views, folder, options @ ..] if flag == "--photos" => photos::command(views, Path::new(folder), options),
         [flag, folder] if flag == "--videos" => videos::command(Path::new(folder)),
         [] => capture::write(&home, &home, false),
         [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),

@@ -20,6 +20,7 @@ mod long;
 mod material;
 mod mesh;
 mod metrics;
+mod photos;
 mod picture;
 mod raster;
 mod scene;
@@ -32,6 +33,7 @@ mod vector;
 mod videos;
 mod world;
 mod yard;
+mod yard_materials;
 
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;

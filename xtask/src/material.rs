@@ -5,7 +5,7 @@
 
 use crate::texture::{Texture, srgb};
 use crate::vector::{V3, smooth_step};
-use crate::yard;
+use crate::yard_materials;
 
 /// The knight's texture.
 pub(crate) const KNIGHT: u16 = 0;
@@ -47,13 +47,13 @@ pub(crate) fn albedo(material: u16, uv: [f64; 2], textures: [&Texture; 2]) -> V3
         BARREL => barrel(uv[1]),
         BALL => ball(uv[0], uv[1]),
         ORB => orb(uv[1]),
-        _ => yard::albedo(material, uv),
+        _ => yard_materials::albedo(material, uv),
     }
 }
 
 /// Emitted light of a material.
 pub(crate) fn glow(material: u16, uv: [f64; 2]) -> V3 {
-    if material == ORB { srgb(70, 190, 200) } else { yard::glow(material, uv) }
+    if material == ORB { srgb(70, 190, 200) } else { yard_materials::glow(material, uv) }
 }
 
 /// 1 inside [from, to], with soft ends.

@@ -7,7 +7,7 @@ use crate::raster::{Edges, NOTHING, SUPERSAMPLING, Visibility, corners, sample_r
 use crate::scene::{BACK, FRONT, Frame, SIDE};
 use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
-use crate::yard;
+use crate::yard_materials;
 
 /// A rendered image.
 pub(crate) struct Picture {
@@ -127,7 +127,7 @@ impl SampleShader<'_> {
         let light = frame.light.arriving(point, normal, openness(frame, point, normal, triangle.object));
         let moving = f64::from(u8::from(triangle.object != 0));
         let mut color = color.scaled_by(light) + material::glow(triangle.material, uv);
-        let gloss = yard::gloss(triangle.material);
+        let gloss = yard_materials::gloss(triangle.material);
         if gloss > 0.0 {
             color = color + frame.light.mirrored(point, normal, (camera.position - point).unit(), gloss);
         }

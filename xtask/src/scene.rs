@@ -71,7 +71,7 @@ impl Stage {
 
     /// Both characters in the yard instead of the hall.
     pub(crate) fn yard(folder: &Path) -> Result<Stage> {
-        Self::with_set(folder, yard::ground(), yard::props())
+        Self::with_set(folder, yard::ground([SIDE, BACK, FRONT]), yard::props(BACK))
     }
 
     fn with_set(folder: &Path, mut fixed: Mesh, props: Mesh) -> Result<Stage> {

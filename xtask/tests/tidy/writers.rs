@@ -6,7 +6,7 @@ use super::{code, files, is_test, read, report};
 const CALLS: [&str; 5] = ["fs::write(", "File::create(", "fs::rename(", "File::create_new(", ".create(true)"];
 
 /// Sources that contain one, and why. The helper itself comes first.
-const WRITERS: [(&str, &str); 10] = [
+const WRITERS: [(&str, &str); 11] = [
     ("crates/splat4d-train/src/output/", "the helper; locks, lists that grow, and files that are moved aside and back"),
     ("crates/splat4d-fuzz/src/", "damaged inputs in temporary folders"),
     ("crates/splat4d-import/src/recording/assist.rs", "renames a list that it keeps"),
@@ -17,6 +17,7 @@ const WRITERS: [(&str, &str); 10] = [
         "crates/splat4d-workflow/src/growing.rs",
         "the playback file of a capture that still trains: its header comes last",
     ),
+    ("crates/splat4d-workflow/src/sound.rs", "at the helper's temporary name"),
     ("crates/splat4d-workflow/src/video.rs", "at the helper's temporary name, frame by frame"),
     ("studies/src/", "a folder that is renamed when all of it is there; files in temporary folders"),
     ("xtask/src/chaos/", "what the chaos tests break"),
