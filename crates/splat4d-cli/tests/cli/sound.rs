@@ -65,7 +65,7 @@ fn sound_is_baked_kept_cut_and_left_out() {
     };
     assert!((begins(&put(&own, "own.m4a"), 0.0)).abs() < OFF);
     let told = splat4d(&["info", str(&file)]).run().ok();
-    assert!(told.contains("sound") && told.contains("SOUN") && told.contains("kbit/s"), "{told}");
+    assert!(told.contains("\nsound ") && told.contains("kbit/s"), "{told}");
     splat4d(&["info", str(&file), "--strict"]).run().ok();
 
     // Kept as it is, or left out with a word.
@@ -119,9 +119,10 @@ fn films_in_real_time_have_sound() {
         let told = splat4d(&["render", str(&file), "-o", str(&out), "--size", "32x24"]).args(more).run().ok();
         (told, out)
     };
-    let (_, whole) = film("whole.mp4", &[]);
+    // An orbit of a short clip is slower than the clip, unless its length is stated.
+    let (_, whole) = film("whole.mp4", &["--seconds", "1"]);
     assert!(begins(&decoded(&whole), 0.0).abs() < OFF);
-    let (_, later) = film("later.mp4", &["--from", "0.4"]);
+    let (_, later) = film("later.mp4", &["--from", "0.4", "--seconds", "0.6"]);
     assert!((begins(&decoded(&later), 0.4) - 0.4).abs() < OFF);
     for (name, more) in
         [("slow.mp4", &["--slow-motion", "2"][..]), ("frozen.mp4", &["--freeze", "0.5"]), ("film.png", &[])]
