@@ -86,6 +86,7 @@ fn walk(views: usize, [width, height]: [usize; 2]) -> Vec<Camera> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::vector::V3;
     use crate::yard_materials::GLAZE;
 
     #[test]

@@ -307,8 +307,8 @@ fn sound_of<'a>(
 ) -> Option<(&'a Sound, f64)> {
     let sound = source.sound.as_ref()?;
     let (first, last) = (shots[0].time, shots[0].time + shots.len() as f64 / fps);
-    // A film that is stretched to whole frames is off by half of one at its end.
-    let runs = |(i, shot): (usize, &paths::Shot)| (shot.time - first - i as f64 / fps).abs() <= 0.5 / fps + ROUNDING;
+    // An orbit's last frame shows the clip's end, so that it is off by one frame there.
+    let runs = |(i, shot): (usize, &paths::Shot)| (shot.time - first - i as f64 / fps).abs() <= 1.0 / fps + ROUNDING;
     let why = if !output.extension().is_some_and(|e| ["mp4", "mkv", "mov"].iter().any(|v| e.eq_ignore_ascii_case(v))) {
         "this output holds images alone"
     } else if !shots.iter().enumerate().all(runs) || shots.len() == 1 {

@@ -77,6 +77,7 @@ pub(crate) fn chosen(
         SoundChoice::Kept => Ok(own),
         SoundChoice::None => Ok(None),
         SoundChoice::File(file) => {
+            std::fs::metadata(file).map_err(|e| files::cannot_read(file, e))?;
             console.phase("converting the sound", 0, 0);
             let clip = seconds(scene);
             let sound = part(file, [0.0, clip], scene.clip[0], near)?;

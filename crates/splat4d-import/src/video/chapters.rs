@@ -153,11 +153,14 @@ impl Source for Joined {
     fn sounds(&self) -> Vec<(PathBuf, Option<usize>, f64)> {
         let end = |i: usize| self.starts.get(i + 1).copied().or(self.info.duration).unwrap_or(0.0);
         let silence = (PathBuf::new(), None, 0.0);
-        let part = |(i, part): (usize, &Box<dyn Source>)| {
+        if !self.info.sound {
+            return Vec::new();
+        }
+        let parts = self.parts.iter().enumerate().map(|(i, part)| {
             let (path, stream, _) = part.sounds().pop().unwrap_or(silence.clone());
             (path, stream, end(i) - self.starts[i])
-        };
-        if self.info.sound { self.parts.iter().enumerate().map(part).collect() } else { Vec::new() }
+        });
+        parts.collect()
     }
 
     fn fingerprint(&self) -> Result<String> {

@@ -83,10 +83,10 @@ impl Sound {
 
 /// Seconds of an MP4 file (ISO/IEC 14496-12 and -14) with one track of AAC and nothing else.
 fn length(file: &[u8]) -> Result<f64> {
-    let outer = boxes(file)?;
-    if outer.first().is_none_or(|(kind, _)| kind != b"ftyp") {
+    if file.get(4..8) != Some(b"ftyp") {
         return Err(wrong("it does not begin as one"));
     }
+    let outer = boxes(file)?;
     if let Some((kind, _)) = outer.iter().find(|(kind, _)| !OUTER.contains(&kind)) {
         return Err(wrong(&format!("it has a box `{}`", kind.escape_ascii())));
     }
