@@ -86,7 +86,7 @@ pub struct Baking {
     /// Most entries of the palette.
     pub palette: usize,
     pub poster: bool,
-    /// What is heard; only [`bake`] uses it.
+    /// What is heard; only [`bake`](fn@bake) uses it.
     pub sound: SoundChoice,
     /// When it is to be done.
     pub deadline: Deadline,

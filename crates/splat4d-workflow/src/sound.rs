@@ -9,7 +9,8 @@ use splat4d::format::playback::{self, Sound};
 use splat4d::layers::Scene;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
-use splat4d_import::video::write_sound;
+#[cfg(feature = "import")]
+use splat4d_import::video::write_sound as convert;
 use splat4d_train::output::Staged;
 use std::path::{Path, PathBuf};
 
@@ -92,8 +93,13 @@ pub(crate) fn chosen(
 /// Seconds `from` to `from + seconds` of a file as the sound that begins at second `start` of the scene.
 fn part(file: &Path, [from, seconds]: [f64; 2], start: f64, near: &Path) -> Result<Sound> {
     let staged = Staged::new(&near.with_extension("m4a"))?;
-    write_sound(file, [from, seconds], staged.path())?;
+    convert(file, [from, seconds], staged.path())?;
     Sound::try_from((start, files::read(staged.path())?)).map_err(|e| e.at(file.display()))
+}
+
+#[cfg(not(feature = "import"))]
+fn convert(_: &Path, _: [f64; 2], _: &Path) -> Result<()> {
+    Err(crate::parts::left_out("the conversion of sound", "import"))
 }
 
 /// The sound of an edited scene: cut as its clip; none where time runs otherwise. A line reports what became of it.

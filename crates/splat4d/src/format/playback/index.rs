@@ -183,8 +183,8 @@ impl Index {
         Ok(header.index_at..header.index_at + header.index_bytes as u64)
     }
 
-    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`,
-    /// where it is known, is how long the file really is: a shorter one is cut short, which is no error here.
+    /// Understands the start of a file; `prefix` holds all bytes up to the end of its index ([`place`](Self::place)).
+    /// `file_len`, where it is known, is how long the file really is: a shorter one is cut short, which is no error here.
     ///
     /// Errors: not a playback file, a newer major version, damage, a required section of an unknown kind.
     pub fn parse(prefix: &[u8], file_len: Option<u64>) -> Result<Self> {
