@@ -21,6 +21,8 @@ export class Sound extends EventTarget {
   /** Whether the browser refuses to play before the page is touched. */
   blocked = false;
   #audio = null;
+  /** Whether the browser has read it, and can play it. */
+  #there = false;
   #span;
   #muted = false;
   #volume = 1;
@@ -59,11 +61,13 @@ export class Sound extends EventTarget {
       this.drop();
       throw new SceneError('This browser cannot play the sound', 'sound', 'The scene plays without it.');
     }
-    if (audio === this.#audio) this.#changed();
+    if (audio !== this.#audio) return;
+    this.#there = true;
+    this.#changed();
   }
 
-  /** Whether there is sound. */
-  get there() { return !!this.#audio; }
+  /** Whether there is sound that this browser plays. */
+  get there() { return this.#there; }
   get muted() { return this.#muted; }
   set muted(on) {
     this.#muted = !!on;
@@ -131,6 +135,7 @@ export class Sound extends EventTarget {
     document.removeEventListener('visibilitychange', this.#hidden);
     URL.revokeObjectURL(audio.src);
     this.#audio = null;
+    this.#there = false;
     this.blocked = false;
     audio.removeAttribute('src');
     audio.load();
