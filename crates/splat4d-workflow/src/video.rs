@@ -20,6 +20,8 @@ const ENDINGS: &str =
     "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
 /// Remedy where ffmpeg is missing.
 const INSTEAD: &str = "Install ffmpeg, or write an animated .png or a folder of images instead (option `output` NAME.png, option `output` FOLDER).";
+/// What is in the folder in which ffmpeg works: the film and its sound.
+const FILES: [&str; 2] = ["film", "sound.m4a"];
 /// Most bytes kept of what ffmpeg states.
 const STDERR_BYTES: usize = 64 << 10;
 
@@ -40,8 +42,9 @@ pub enum Film {
         child: Child,
         /// Destination of frames.
         pipe: Option<ChildStdin>,
-        /// The file that ffmpeg reads sound from; removed with the film's maker.
-        sound: Option<Staged>,
+        /// A folder for what ffmpeg writes and reads, removed with the film's maker. A program that outlives ours opens
+        /// nothing there once it is removed.
+        work: Staged,
         /// Collects what ffmpeg states.
         words: Option<std::thread::JoinHandle<Vec<u8>>>,
     },
@@ -93,16 +96,23 @@ impl Film {
         sound: Option<(&Sound, f64)>,
     ) -> Result<Self> {
         let output = Staged::new(path)?;
+        if output.path().exists() {
+            return Err(Error::input("is a device or a pipe, and films need a file")
+                .at(path.display())
+                .remedy(ENDINGS));
+        }
+        let work = Staged::new(path)?;
         // ffmpeg would report an unwritable place only after the first frame, in its own words.
-        File::create(output.path()).map_err(|e| cannot_write(path, e))?;
+        std::fs::create_dir(work.path()).map_err(|e| cannot_write(path, e))?;
         let container = if ending == "mkv" { "matroska" } else { ending };
         let mut command = Command::new("ffmpeg");
         command.args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "-"]);
-        let sound = sound.map(|(sound, begins)| Ok((heard(sound, path)?, sound.span[0] - begins))).transpose()?;
-        match &sound {
-            Some((file, late)) => {
-                command.arg("-i").arg(file.path()).args(["-map", "0:v", "-map", "1:a", "-c:a", "aac", "-b:a", AUDIO]);
+        match sound {
+            Some((sound, begins)) => {
+                let (file, late) = (work.path().join(FILES[1]), sound.span[0] - begins);
+                std::fs::write(&file, &sound.mp4).map_err(|e| cannot_write(path, e))?;
+                command.arg("-i").arg(file).args(["-map", "0:v", "-map", "1:a", "-c:a", "aac", "-b:a", AUDIO]);
                 // What the film begins after is left out; sound that begins later is preceded by silence.
                 let cut = format!("atrim=start={:.6},asetpts=PTS-STARTPTS", (-late).max(0.0));
                 let delay = format!("adelay=delays={:.0}S:all=1", late.max(0.0) * SAMPLES);
@@ -111,10 +121,11 @@ impl Film {
             }
             None => drop(command.arg("-an")),
         }
-        let sound = sound.map(|(file, _)| file);
         // 4:2:0 needs even sides.
         command.args(["-vf", "crop=max(2\\,trunc(iw/2)*2):max(2\\,trunc(ih/2)*2)", "-c:v", "libx264", "-crf", CRF]);
-        command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", container]).arg(output.path());
+        command
+            .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", container])
+            .arg(work.path().join(FILES[0]));
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|e| {
             Error::environment("the program ffmpeg, which writes films, cannot be started", e).remedy(INSTEAD)
@@ -130,7 +141,7 @@ impl Film {
                 all
             })
         });
-        Ok(Self::Mp4 { output, child, pipe, sound, words })
+        Ok(Self::Mp4 { output, work, child, pipe, words })
     }
 
     fn apng(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> Result<Self> {
@@ -181,7 +192,11 @@ impl Film {
             }
         }
         match self {
-            Self::Mp4 { output, .. } => output.keep()?,
+            Self::Mp4 { output, work, .. } => {
+                let film = work.path().join(FILES[0]);
+                std::fs::rename(film, output.path()).map_err(|e| cannot_write(output.path(), e))?;
+                output.keep()?;
+            }
             Self::Apng { output, writer } => {
                 writer.finish().map_err(|e| full(output.path(), e))?;
                 output.keep()?;
@@ -208,13 +223,6 @@ impl Film {
         let words = if last.is_empty() { "it printed nothing".into() } else { last.join("; ") };
         Error::environment("ffmpeg could not write the film", std::io::Error::other(words)).remedy(INSTEAD)
     }
-}
-
-/// The sound as a file next to the film, under a temporary name.
-fn heard(sound: &Sound, film: &Path) -> Result<Staged> {
-    let staged = Staged::new(&film.with_extension("sound.m4a"))?;
-    std::fs::write(staged.path(), &sound.mp4).map_err(|e| cannot_write(film, e))?;
-    Ok(staged)
 }
 
 /// An error of the PNG encoder: nearly always the disk.
@@ -295,6 +303,24 @@ mod tests {
         film.finish().unwrap();
         let bytes = std::fs::read(&path).unwrap();
         assert_eq!(&bytes[4..8], b"ftyp", "an mp4 begins with its type box");
+    }
+
+    #[test]
+    fn a_program_that_outlives_ours_leaves_no_film() {
+        if !have_ffmpeg() {
+            println!("skipped: there is no ffmpeg");
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let mut film = Film::create(&folder.path().join("film.mp4"), [16, 16], 24.0, 2, None).unwrap();
+        let Film::Mp4 { work, child, pipe, .. } = &mut film else { panic!("an mp4 is written by ffmpeg") };
+        // As the next command does where this one was killed.
+        std::fs::remove_dir_all(work.path()).unwrap();
+        pipe.as_mut().unwrap().write_all(&picture(3, 16, 16).data).unwrap();
+        drop(pipe.take());
+        child.wait().unwrap();
+        drop(film);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]

@@ -30,6 +30,10 @@ const DEAD: Duration = Duration::from_secs(60);
 const WATCH: Duration = Duration::from_secs(15);
 /// Interval between reads of a record that is watched, or at a lock that is waited for.
 const POLL: Duration = Duration::from_millis(100);
+/// A lock that is held for less time belongs to a process that looked whether there is an owner; and the interval
+/// between attempts meanwhile. Looking takes two calls of the system.
+const GLANCE: Duration = Duration::from_millis(100);
+const AGAIN: Duration = Duration::from_millis(5);
 
 /// The owner of a folder, as its record states it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,7 +89,7 @@ impl std::fmt::Display for OwnerRecord {
 pub struct Owner {
     record: PathBuf,
     entry: OwnerRecord,
-    /// Held, not read: closing it releases the lock.
+    /// Held, not read.
     lock: Option<File>,
     done: Arc<(Mutex<bool>, Condvar)>,
     heart: Option<JoinHandle<()>>,
@@ -114,6 +118,7 @@ impl Owner {
         let state = folder.join(STATE);
         let fail = |e| cannot_write(folder, e);
         let record = state.join(RECORD);
+        let began = Instant::now();
         let lock = loop {
             std::fs::create_dir_all(&state).map_err(fail)?;
             check_plain(&state.join(LOCK))?;
@@ -127,6 +132,11 @@ impl Owner {
             match lock.try_lock() {
                 // A file system without locks: the heartbeat alone decides.
                 Ok(()) | Err(TryLockError::Error(_)) => {}
+                // Perhaps only a process that looks whether there is an owner.
+                Err(TryLockError::WouldBlock) if began.elapsed() < GLANCE => {
+                    std::thread::sleep(AGAIN);
+                    continue;
+                }
                 Err(TryLockError::WouldBlock) => return Ok(Err(OwnerRecord::read(&record))),
             }
             if is_at(&lock, &state.join(LOCK)) {
@@ -199,6 +209,7 @@ impl Owner {
         if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
             return Some(OwnerRecord::read(&record));
         }
+        let _ = lock.unlock();
         let other = OwnerRecord::read(&record).filter(|s| s.machine != machine())?;
         age(&record, SystemTime::now()).is_some_and(|age| age <= DEAD).then_some(Some(other))
     }
@@ -212,7 +223,10 @@ impl Owner {
 impl Drop for Owner {
     fn drop(&mut self) {
         self.rest();
-        drop(self.lock.take());
+        // Not by closing it: a program that another thread starts at this moment has a copy of the open file.
+        if let Some(lock) = self.lock.take() {
+            let _ = lock.unlock();
+        }
     }
 }
 
@@ -352,6 +366,25 @@ mod tests {
     }
 
     /// A record of a process that was killed: the next process takes over at once, also if its process id was reused.
+    #[test]
+    fn neither_a_look_nor_a_copy_of_the_open_file_keeps_a_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let owner = Owner::of(folder.path(), "train").unwrap();
+        // As a program has one between its start and its own first instruction.
+        let copy = owner.lock.as_ref().unwrap().try_clone().unwrap();
+        drop(owner);
+        drop(Owner::of(folder.path(), "eval").unwrap());
+        drop(copy);
+        let look = File::open(folder.path().join(STATE).join(LOCK)).unwrap();
+        look.lock_shared().unwrap();
+        let looked = std::thread::spawn(move || {
+            std::thread::sleep(GLANCE / 4);
+            drop(look);
+        });
+        drop(Owner::of(folder.path(), "train").unwrap());
+        looked.join().unwrap();
+    }
+
     #[test]
     fn a_dead_owner_of_this_machine_is_replaced_at_once() {
         let folder = tempfile::tempdir().unwrap();

@@ -52,7 +52,7 @@ pub(super) fn remove_leftovers(folder: &Path) {
     for folder in list::folders(folder) {
         for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()) {
             if is_left_over(&path) {
-                let _ = std::fs::remove_file(path);
+                remove(&path);
             }
         }
     }
@@ -64,6 +64,12 @@ pub(super) fn remove_leftovers_once(file: &Path) {
     if LOOKED.lock().unwrap_or_else(|e| e.into_inner()).insert(folder.to_owned()) {
         remove_leftovers(folder);
     }
+}
+
+/// Removes a temporary file, or a folder of them.
+pub(super) fn remove(path: &Path) {
+    let folder = std::fs::symlink_metadata(path).is_ok_and(|m| m.is_dir());
+    let _ = if folder { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
 }
 
 /// Whether this is a name that [`Staged`] makes up.

@@ -2,13 +2,14 @@
 //! folder, flushed to the disk, then renamed. All files of the workspace are written here (`xtask/tests/tidy/writers.rs`).
 
 use super::owner::check_free;
-use super::temporary::{remove_leftovers_once, temporary_name};
+use super::temporary::{remove, remove_leftovers_once, temporary_name};
 use super::{NO_SPACE, cannot_write, list};
 use crate::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// A file under a temporary name next to its place; [`keep`](Self::keep) renames it, dropping it removes it.
+/// A file under a temporary name next to its place; [`keep`](Self::keep) renames it, dropping it removes it. Who
+/// needs a place for several files may create a folder at [`path`](Self::path), which is not kept.
 #[derive(Debug)]
 pub struct Staged {
     temporary: Option<PathBuf>,
@@ -68,7 +69,7 @@ impl Staged {
 impl Drop for Staged {
     fn drop(&mut self) {
         if let Some(temporary) = &self.temporary {
-            let _ = std::fs::remove_file(temporary);
+            remove(temporary);
         }
     }
 }
@@ -126,9 +127,12 @@ mod tests {
             std::fs::write(at(name.clone()), b"x").unwrap();
         }
         File::options().write(true).open(at(left[1].clone())).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        let work = format!(".film.mp4.{}-{}-3{ENDING}", machine(), u32::MAX);
+        std::fs::create_dir(at(work.clone())).unwrap();
+        std::fs::write(at(work.clone()).join("film"), b"x").unwrap();
         let staged = Staged::new(&at("new.ply".into())).unwrap();
         std::fs::write(staged.path(), b"new").unwrap();
-        for name in &left {
+        for name in left.iter().chain([&work]) {
             assert!(!at(name.clone()).exists(), "{name}");
         }
         for name in &stays {
