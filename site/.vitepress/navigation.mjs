@@ -90,6 +90,7 @@ const EXPLANATION = [
   ['SECURITY', 'Security'],
 ];
 const MEASUREMENTS = [
+  ['docs/best', 'Best figures'],
   ['docs/suite', 'Suite of captures'],
   ['docs/benchmarks', 'Benchmarks'],
   ['studies/records/index', 'All records'],

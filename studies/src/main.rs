@@ -12,9 +12,11 @@
 //! | `made/` | synthetic captures, each hard for one reason |
 //! | `e00.rs`, `e01.rs`, `e02.rs`, `e03.rs`, `models.rs` | the studies; `e02/` is the ablation of the filter |
 //! | `suite/` | the recipe on a list of captures (docs/suite.md) |
+//! | `best.rs` | the page of the best figures (docs/best.md) |
 //! | `bench.rs`, `bench/` | pinned scenes, stages, training steps, growth, GPU stages, playback, other programs (`other_programs/with_gsplat.py`); each time with its lower bound (docs/benchmarks.md) |
 
 mod bench;
+mod best;
 mod cells;
 mod deformation;
 mod e00;
@@ -42,6 +44,7 @@ Examples:
   studies models examples/knight       every motion model, three minutes each
   studies suite --data sets            the recipe on captures of every kind
   studies bench                        speed of this machine, stage by stage
+  studies best                         the best figure of every capture and model, next to published ones
   studies make one-wall runs/one-wall  a synthetic capture that is hard for one reason
 
 A study can be stopped at any time and continues where it was.";
@@ -65,6 +68,7 @@ enum Study {
     Models(models::Args),
     Suite(suite::Args),
     Bench(Box<bench::Args>),
+    Best(best::Args),
     /// Render a synthetic capture that is hard for one reason
     Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
@@ -83,6 +87,7 @@ fn main() -> ExitCode {
             Study::Models(args) => models::run(&args, console),
             Study::Suite(args) => suite::run(&args, console),
             Study::Bench(args) => bench::run(&args, threads, console),
+            Study::Best(args) => best::run(&args, console),
             Study::Make(args) => made::run(&args, console),
             Study::Train(args) => verbs::train::run(&args, console),
         })

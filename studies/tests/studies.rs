@@ -203,3 +203,27 @@ fn help_teaches() {
     }
     assert!(!help.lines().any(|l| l.trim_start().starts_with("train ")), "what cells are made with is no study");
 }
+
+/// docs/best.md is what `studies best` writes, and every figure on it is in its record.
+#[test]
+fn the_page_of_best_figures_is_written_and_every_figure_has_its_record() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let work = tempfile::tempdir().unwrap();
+    let file = work.path().join("best.md");
+    studies(&["best", "-o", str(&file)]).run().ok();
+    let (page, there) = (std::fs::read_to_string(&file).unwrap(), root.join("docs/best.md"));
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        std::fs::write(&there, &page).unwrap();
+    }
+    assert_eq!(std::fs::read_to_string(&there).unwrap(), page, "UPDATE_GOLDEN=1 writes the page again");
+    let rows: Vec<&str> = page.lines().filter(|l| l.starts_with("| `")).collect();
+    assert!(rows.len() > 10);
+    for row in rows {
+        let cells: Vec<&str> = row.split('|').map(str::trim).collect();
+        let record = row.split("../studies/records/").nth(1).unwrap().split(')').next().unwrap();
+        let text = std::fs::read_to_string(root.join("studies/records").join(record)).unwrap();
+        for figure in &cells[2..5] {
+            assert!(text.contains(figure.trim_end_matches('0')), "{record} lacks {figure} of {row}");
+        }
+    }
+}

@@ -88,16 +88,21 @@ fn drum(mesh: &mut Mesh, place: &Affine) {
             mesh.push_vertex(place.point(v3(r * cos, h * DRUM_HEIGHT, r * sin)), place.turn(normal).unit(), [turn, h]);
         }
     }
+    push_grid(mesh, first, RELIEF, IRON);
+    let rim = DRUM_RADIUS + 0.01;
+    mesh.lathe(place, &[(rim, DRUM_HEIGHT - 0.005), (0.1, DRUM_HEIGHT + 0.04), (0.0, DRUM_HEIGHT + 0.05)], 64, RAIL, 0);
+}
+
+/// Triangles of a closed grid whose vertices, one more per row than cells, begin at `first`.
+fn push_grid(mesh: &mut Mesh, first: u32, [around, up]: [u32; 2], material: u16) {
     for j in 0..up {
         for i in 0..around {
             let a = first + j * (around + 1) + i;
             let b = a + around + 1;
-            mesh.push_triangle([a, a + 1, b + 1], IRON, 0);
-            mesh.push_triangle([a, b + 1, b], IRON, 0);
+            mesh.push_triangle([a, a + 1, b + 1], material, 0);
+            mesh.push_triangle([a, b + 1, b], material, 0);
         }
     }
-    let rim = DRUM_RADIUS + 0.01;
-    mesh.lathe(place, &[(rim, DRUM_HEIGHT - 0.005), (0.1, DRUM_HEIGHT + 0.04), (0.0, DRUM_HEIGHT + 0.05)], 64, RAIL, 0);
 }
 
 /// A solid of revolution whose profile is a Catmull-Rom spline through (radius, height).
@@ -140,12 +145,5 @@ fn land(mesh: &mut Mesh, side: f64) {
             mesh.push_vertex(v3(x, height(x, z), z), normal, [x, z]);
         }
     }
-    for j in 0..RINGS {
-        for i in 0..AROUND {
-            let a = first + j * (AROUND + 1) + i;
-            let b = a + AROUND + 1;
-            mesh.push_triangle([a, a + 1, b + 1], LAND, 0);
-            mesh.push_triangle([a, b + 1, b], LAND, 0);
-        }
-    }
+    push_grid(mesh, first, [AROUND, RINGS], LAND);
 }

@@ -1,13 +1,15 @@
 //! The work behind `compress`: rounds until size limit and quality guard are met, the file, scores, comparison and
 //! report.
 
+use crate::activity::Activity;
 use crate::adopting::{self, OnCapture};
 use crate::baking;
-use crate::draw::antialias;
+use crate::draw::{Channel, Painter, antialias};
 use crate::evaluating::{self, Measure};
 use crate::events::{Listener, Recorded};
 use crate::measure::{SIZE, Side, Subject, What, in_turns, measured_views_of};
-use crate::report::compress::{Compressed, Guard, Step, Tried};
+use crate::report::compress::{Compressed, Guard, REMOVED, Step, Tried, VIEWS};
+use crate::report::pictures;
 use crate::run_folder::{self, COMPRESS, ORDER, Origin, Run};
 use crate::sound;
 use crate::source::{Source, not_empty, read_scene};
@@ -18,7 +20,7 @@ use splat4d::device::Device;
 use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, with_extras, write_pages};
 use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
-use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::capture::{Capture, Frame, ImageStore};
 use splat4d_train::compress::{self, Compression, Job, Level};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::event::Event;
@@ -384,7 +386,10 @@ impl Work {
             if !self.refused(before, &after, file.bytes, console)? {
                 break (file, Some(after));
             }
+            self.drop_removed()?;
         };
+        self.draw_removed(&original)?;
+        self.drop_removed()?;
         if let (Some(before), Some(after)) = (before, after) {
             let compared = self.compare(&source, &original, [&before, &after], stop, recorded)?;
             print_summary(&compared, self.size, console);
@@ -454,7 +459,40 @@ impl Work {
             }),
             tried: order.tried.clone(),
             warnings: recorded.warnings(),
+            activity: [Some(original.scene.clone()), read_scene(&self.dir.join("scene.safetensors")).ok()]
+                .map(|scene| scene.and_then(|s| Activity::of(&s))),
         })
+    }
+
+    /// Scenes of what the rounds of pruning removed.
+    fn removed(&self) -> Vec<PathBuf> {
+        let file = |round: usize| self.dir.join(format!("removed-{round}.safetensors"));
+        (1..).map(file).take_while(|f| f.is_file()).collect()
+    }
+
+    /// Deletes them: they are as large as the original, and only a compression that was stopped needs them.
+    fn drop_removed(&self) -> Result<()> {
+        self.removed().iter().try_for_each(|f| std::fs::remove_file(f).map_err(|e| files::cannot_write(f, e)))
+    }
+
+    /// Draws the Gaussians that pruning removed, alone on black, in the held-out views that the report shows.
+    fn draw_removed(&self, original: &Original<'_>) -> Result<()> {
+        let mut all = Scene::default();
+        for file in self.removed() {
+            let one = read_scene(&file)?;
+            let layers = all.layers.into_iter().chain(one.layers.iter().cloned()).collect();
+            all = Scene { layers, ..one };
+        }
+        if all.is_empty() {
+            return Ok(());
+        }
+        let held: Vec<&Frame> = original.capture.held.iter().map(|&i| &original.capture.frames[i]).collect();
+        let mut painter = Painter::new(&all, [0.0; 3], original.recipe.appearance.antialias, false);
+        for i in pictures::spread(held.len(), VIEWS) {
+            let image = painter.picture(&held[i].view, held[i].time.0, Channel::Color, [0.0, 1.0]);
+            files::write(&self.dir.join(REMOVED).join(format!("{i:05}.png")), &image.png())?;
+        }
+        Ok(())
     }
 
     /// The original, trained on for as many steps as fine-tuning took, nothing removed and nothing quantised.

@@ -6,6 +6,7 @@ mod playback;
 
 pub use playback::{Conformance, conformance};
 
+use crate::activity::Activity;
 use crate::chunked;
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
@@ -581,6 +582,10 @@ fn of_scene(scene: &Scene<f32>) -> Inspection {
         let [x, y, z] = scene.offset;
         line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions to get world coordinates"));
     }
+    let activity = Activity::of(scene);
+    if let Some(activity) = &activity {
+        line(&mut text, "active", &activity.sentence());
+    }
     let finite = low[0] <= high[0];
     if finite {
         let corner = |c: [f64; 3]| format!("{:.3} {:.3} {:.3}", c[0], c[1], c[2]);
@@ -598,6 +603,7 @@ fn of_scene(scene: &Scene<f32>) -> Inspection {
         "offset": scene.offset, "head": scene.head.name(), "clip": scene.clip, "fps": scene.fps, "bounds": finite.then_some([low, high]),
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
+        "activity": activity,
     });
     Inspection { json, text, troubles, listed: Vec::new(), poses_unchecked: false }
 }

@@ -56,6 +56,7 @@
 #![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
 #![allow(missing_docs)] // its interface is not stable yet
 
+pub mod activity;
 pub mod adopting;
 #[cfg(feature = "import")]
 pub mod aligning;

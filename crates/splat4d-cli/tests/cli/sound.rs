@@ -6,8 +6,10 @@ use crate::sample::splat4d;
 use crate::str;
 use splat4d::format::playback::{Sound, sound};
 use splat4d::format::scene;
-use std::path::Path;
+use splat4d::layers::Scene;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use tempfile::TempDir;
 
 /// Samples per second that sounds are compared at.
 const RATE: f64 = 16_000.0;
@@ -41,19 +43,33 @@ fn of(file: &Path) -> Option<Sound> {
     sound(&std::fs::read(file).unwrap()).unwrap()
 }
 
+/// A moving scene and three seconds of sound, in a folder where `file` is not written yet.
+struct Taken {
+    work: TempDir,
+    birds: PathBuf,
+    wave: PathBuf,
+    file: PathBuf,
+    made: Scene,
+}
+
+fn taken() -> Taken {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    let (birds, wave, file) = (at("birds.safetensors"), at("sound.wav"), at("birds.s4d"));
+    let (made, mut bytes) = (moving(), Vec::new());
+    scene::write(&made, &mut bytes).unwrap();
+    std::fs::write(&birds, bytes).unwrap();
+    std::fs::write(&wave, heard(0.0, 3.0, 0)).unwrap();
+    Taken { work, birds, wave, file, made }
+}
+
 #[test]
 fn sound_is_baked_kept_cut_and_left_out() {
     if !have_ffmpeg() {
         return;
     }
-    let work = tempfile::tempdir().unwrap();
+    let Taken { work, birds, wave, file, made } = taken();
     let at = |name: &str| work.path().join(name);
-    let (birds, wave, file) = (at("birds.safetensors"), at("sound.wav"), at("birds.s4d"));
-    let mut bytes = Vec::new();
-    let made = moving();
-    scene::write(&made, &mut bytes).unwrap();
-    std::fs::write(&birds, bytes).unwrap();
-    std::fs::write(&wave, heard(0.0, 3.0, 0)).unwrap();
     let end = made.clip[1] + 1.0 / made.fps;
     let told = splat4d(&["bake", str(&birds), "-o", str(&file), "--sound", str(&wave)]).run().ok();
     assert!(told.contains("sound.wav: its first") && told.contains("kbit/s"), "{told}");
@@ -107,13 +123,8 @@ fn films_in_real_time_have_sound() {
     if !have_ffmpeg() {
         return;
     }
-    let work = tempfile::tempdir().unwrap();
+    let Taken { work, birds, wave, file, .. } = taken();
     let at = |name: &str| work.path().join(name);
-    let (birds, wave, file) = (at("birds.safetensors"), at("sound.wav"), at("birds.s4d"));
-    let mut bytes = Vec::new();
-    scene::write(&moving(), &mut bytes).unwrap();
-    std::fs::write(&birds, bytes).unwrap();
-    std::fs::write(&wave, heard(0.0, 3.0, 0)).unwrap();
     splat4d(&["bake", str(&birds), "-o", str(&file), "--sound", str(&wave)]).run().ok();
     let film = |name: &str, more: &[&str]| {
         let out = at(name);

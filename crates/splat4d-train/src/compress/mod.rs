@@ -69,7 +69,8 @@ pub struct Compressed {
 }
 
 /// Compresses into the run folder `dir`, or continues there. The folder's `scene.safetensors` is what a reader of the
-/// file decodes.
+/// file decodes; with a codec, `removed-K.safetensors` has the Gaussians that round K of pruning removed,
+/// as they were then.
 ///
 /// Errors: settings out of range, a capture without training views, a folder that holds another run, a scene that
 /// cannot be baked.
@@ -81,7 +82,7 @@ pub fn compress(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Compressed> {
     job.settings.check()?;
-    let prepared = prepared(job)?;
+    let prepared = Prepared { dir: job.settings.codec.then(|| dir.to_owned()), ..prepared(job)? };
     let mut stages = stages::float_stages(&prepared)?;
     let file = job.settings.codec.then(|| stages::file_stage(&prepared)).transpose()?;
     let (stage, codec) = file.unzip();
@@ -131,6 +132,7 @@ fn prepared(job: &Job<'_>) -> Result<Prepared> {
         cameras: cameras(&job.capture),
         settings: job.settings.clone(),
         count: job.source.len(),
+        dir: None,
     })
 }
 

@@ -10,12 +10,15 @@ use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
 use crate::maintenance::importance::{MaskConfig, ScoreConfig, key_masks, prune, score};
 use crate::methods::{Hook, Rate, Stage, TrainContext, tuning};
+use crate::output::write_atomically_with;
 use crate::recipe::Recipe;
 use splat4d::format::playback::{WriteConfig, read_pages, write};
+use splat4d::format::scene as scene_file;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::render::Antialias;
-use splat4d::scene::Camera;
+use splat4d::scene::{Camera, RowEdit};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Fine-tuning begins where a run's rates were after this share of it: the remaining Gaussians are already in position.
@@ -35,6 +38,8 @@ pub(super) struct Prepared {
     pub settings: Compression,
     /// Gaussians of the scene that is compressed.
     pub(super) count: usize,
+    /// The run's folder, where what is removed is kept, a scene per round; `None`: nowhere.
+    pub(super) dir: Option<PathBuf>,
 }
 
 impl Prepared {
@@ -76,7 +81,8 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
             let left = (1.0 - s.prune).powf((round + 1) as f64 / rounds as f64);
             let removed = if last { s.prune } else { 1.0 - left };
             let keep = prepared.count - (removed * prepared.count as f64).round() as usize;
-            stage.start = Some(pruning(prepared.clone(), keep.max(1), filter && last));
+            let removed = prepared.dir.as_ref().map(|dir| dir.join(format!("removed-{}.safetensors", round + 1)));
+            stage.start = Some(pruning(prepared.clone(), keep.max(1), filter && last, removed));
             Ok(stage)
         })
         .collect()
@@ -103,20 +109,37 @@ fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
 }
 
-/// Scores, prunes to `keep` Gaussians, and makes masks where they are needed already.
-fn pruning(prepared: Prepared, keep: usize, filter: bool) -> Hook {
+/// Scores, prunes to `keep` Gaussians, and makes masks where they are needed already. What is removed becomes the file
+/// `removed`.
+fn pruning(prepared: Prepared, keep: usize, filter: bool, removed: Option<PathBuf>) -> Hook {
     Box::new(move |scene: &mut Scene<f32>, progress| {
         if keep < scene.len() {
             let share = 1.0 - keep as f64 / scene.len() as f64;
             let scores = score(scene, prepared.frames.as_ref(), &prepared.score_config()?, &mut |done, total| {
                 progress.phase("scoring Gaussians", done, total);
             })?;
-            for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
+            let edits = prune(scene, &scores, share);
+            if let Some(file) = &removed {
+                write_removed(scene, &edits, file)?;
+            }
+            for (layer, edit) in edits.into_iter().enumerate() {
                 scene.layers[layer].edit(&edit, &Rng::new(prepared.plan.seed, "prune", layer as u64));
             }
         }
         if filter { masks(scene, &prepared, progress) } else { Ok(()) }
     })
+}
+
+/// The scene of the rows that these edits drop.
+fn write_removed(scene: &Scene<f32>, edits: &[RowEdit], file: &Path) -> Result<()> {
+    let mut removed = scene.clone();
+    for (layer, edit) in removed.layers.iter_mut().zip(edits) {
+        let mut dropped = vec![true; layer.params.len()];
+        edit.parent.iter().for_each(|row| dropped[*row as usize] = false);
+        layer.edit(&RowEdit::prune(edit.space, dropped.into_iter()), &Rng::new(0, "removed", 0));
+    }
+    removed.layers.retain(|layer| !layer.params.is_empty());
+    write_atomically_with(file, &mut |out| scene_file::write(&removed, &mut &mut *out))
 }
 
 /// Masks at the settings' interval.

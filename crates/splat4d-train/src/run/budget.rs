@@ -61,15 +61,39 @@ impl<'a> Place<'a> {
         }
     }
 
+    #[cfg(test)]
+    pub(super) fn at(stages: &'a [Stage], progress: Position, left: usize) -> Self {
+        Self { stages, progress, gaussians: [0; 2], left }
+    }
+
     /// Seconds of a step here, as they were timed before the run.
     pub(super) fn step_seconds(&self, timing: &Timing) -> f64 {
         timing.step(self.stages, self.progress.stage, self.progress.stage_step, self.gaussians[0])
     }
 
+    /// Whether the step here is at full size.
+    pub(super) fn is_full_size(&self) -> bool {
+        self.stages.get(self.progress.stage).is_none_or(|s| self.progress.stage_step >= s.half_size_steps)
+    }
+
+    /// Remaining steps of the run [at half size, at full size].
+    pub(super) fn steps_by_size(&self) -> [f64; 2] {
+        let mut left = [0.0; 2];
+        for (number, stage) in self.stages.iter().enumerate().skip(self.progress.stage) {
+            let from = if number == self.progress.stage { self.progress.stage_step } else { 0 };
+            let halves = stage.half_size_steps.min(stage.iterations).saturating_sub(from);
+            left[0] += halves as f64;
+            left[1] += (stage.iterations.saturating_sub(from) - halves) as f64;
+        }
+        // One step of the run may represent several of the schedule, or a part of one.
+        let all = left[0] + left[1];
+        left.map(|n| if all > 0.0 { n * self.left as f64 / all } else { 0.0 })
+    }
+
     /// Steps of the schedule that are left.
     fn schedule_left(&self) -> usize {
         let all: usize = self.stages[self.progress.stage..].iter().map(|s| s.iterations).sum();
-        all - self.progress.stage_step
+        all.saturating_sub(self.progress.stage_step)
     }
 }
 
@@ -114,6 +138,19 @@ impl Planner {
         self.budget.minutes
     }
 
+    /// Seconds of the steps that are left, at the speed of the machine as far as it is known.
+    pub(super) fn left(&self, place: &Place<'_>) -> f64 {
+        let [taken, expected] = self.taken;
+        let so_far = if expected > 0.0 { taken / expected } else { 1.0 };
+        self.mean_step(place, self.slowness.unwrap_or(so_far)) * place.left as f64
+    }
+
+    /// Seconds of one step of the run for one of the remaining schedule; with fewer steps each still takes as long.
+    fn mean_step(&self, place: &Place<'_>, slowness: f64) -> f64 {
+        let ([count, cap], from) = (place.gaussians, [place.progress.stage, place.progress.stage_step]);
+        slowness * self.budget.timing.rest(place.stages, from, count, cap) / place.schedule_left().max(1) as f64
+    }
+
     /// Remembers a step: the seconds that it and what belongs to it took, and those that were expected where it was
     /// taken.
     pub(super) fn add(&mut self, seconds: f64, expected: f64) {
@@ -131,15 +168,12 @@ impl Planner {
         let measured = self.taken[0] / self.taken[1];
         let slowness = self.slowness.map_or(measured, |old| old + NEWEST * (measured - old));
         (self.last_check, self.taken, self.slowness) = (now, [0.0; 2], Some(slowness));
-        let (timing, [count, cap], schedule) = (&self.budget.timing, place.gaussians, place.schedule_left());
+        let schedule = place.schedule_left();
         if schedule == 0 {
             return None;
         }
-        let from = [place.progress.stage, place.progress.stage_step];
-        // One step of the run for one of the schedule; with fewer steps each still takes as long.
-        let rest = slowness * timing.rest(place.stages, from, count, cap);
-        let step = rest / schedule as f64;
-        let finish = slowness * self.budget.finish * timing.last(place.stages, cap);
+        let step = self.mean_step(place, slowness);
+        let finish = slowness * self.budget.finish * self.budget.timing.last(place.stages, place.gaussians[1]);
         let end = now + step * place.left as f64 + finish;
         if step <= 0.0 || (end - all).abs() <= TOLERANCE * all {
             return None;

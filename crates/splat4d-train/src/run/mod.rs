@@ -10,6 +10,7 @@ pub mod dataset;
 mod flows;
 mod identity;
 mod info;
+mod left;
 mod memory;
 mod metrics;
 mod minutes;

@@ -6,6 +6,7 @@ use super::clock::Stopwatch;
 use super::corrected;
 use super::identity::fingerprint;
 use super::info::{ELSEWHERE, elsewhere, read_info};
+use super::left::StepTimes;
 use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
 use super::open::OpenCapture;
@@ -170,25 +171,6 @@ fn lap(clock: &Stopwatch, last: &mut f64) -> f64 {
     now - std::mem::replace(last, now)
 }
 
-/// The duration of this session's steps, without what stages do at their start.
-#[derive(Clone, Copy, Debug, Default)]
-struct Steps {
-    seconds: f64,
-    count: usize,
-}
-
-impl Steps {
-    fn add(&mut self, seconds: f64) {
-        self.seconds += seconds;
-        self.count += 1;
-    }
-
-    /// Seconds a step.
-    fn mean(&self) -> f64 {
-        self.seconds / self.count.max(1) as f64
-    }
-}
-
 /// A run while it is driven.
 pub(super) struct Session<'a> {
     pub(super) run: &'a Path,
@@ -263,7 +245,7 @@ impl Session<'_> {
         let lead = self.budget.filter(|_| first > 0).map_or(0.0, |b| b.before + state.seconds - clock);
         let mut recipe = self.recipe.clone();
         let mut planner = self.budget.map(|b| Planner::new(b, clock + lead, recipe.run.replans.rows()));
-        let (mut steps, mut warned) = (Steps::default(), false);
+        let (mut steps, mut warned) = (StepTimes::default(), false);
         while !trainer.is_done() && !self.stop.load(Ordering::Relaxed) {
             let from = (trainer.progress.stage, trainer.progress.iteration);
             let between = self.clock.seconds() - clock;
@@ -273,7 +255,9 @@ impl Session<'_> {
                 break;
             }
             let entered = from == (0, 0) || from.0 != trainer.progress.stage || trainer.progress.taken == 0;
-            let expected = self.budget.map_or(0.0, |b| Place::of(trainer).step_seconds(&b.timing));
+            let here = Place::of(trainer);
+            let (full_size, expected) =
+                (here.is_full_size(), self.budget.map_or(0.0, |b| here.step_seconds(&b.timing)));
             let step = match trainer.step()? {
                 Ok(step) => step,
                 // A step in which a stop was requested, such as by a failed loss, is invalid and does not count.
@@ -289,7 +273,7 @@ impl Session<'_> {
                 }
             };
             let seconds = lap(&self.clock, &mut clock);
-            steps.add(seconds);
+            steps.add(full_size, seconds);
             state.seconds += seconds;
             if let Some(planner) = &mut planner {
                 planner.add(between + seconds, expected);
@@ -326,7 +310,9 @@ impl Session<'_> {
             let known = state.smooth != [0.0; 2];
             if known && reported.elapsed().as_secs_f64() > PROGRESS_SECONDS || trainer.is_done() {
                 reported = Clock::now();
-                listen(&self.progress(trainer, &state, &steps));
+                let place = Place::of(trainer);
+                let left = planner.as_ref().map_or_else(|| steps.left(&place), |p| p.left(&place));
+                listen(&self.progress(trainer, &state, left));
             }
             let i = trainer.progress.iteration;
             // The start of a later stage may have taken long: it must not be repeated.
@@ -395,7 +381,7 @@ impl Session<'_> {
         });
     }
 
-    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, steps: &Steps) -> Event {
+    fn progress(&self, trainer: &Trainer<'_>, state: &RunState, seconds_left: f64) -> Event {
         let (iteration, iterations) = (trainer.progress.iteration, trainer.iterations());
         Event::Progress {
             iteration,
@@ -405,7 +391,7 @@ impl Session<'_> {
             psnr: psnr(state.smooth[1]),
             gaussians: trainer.scene().len(),
             seconds: state.seconds,
-            seconds_left: steps.mean() * iterations.saturating_sub(iteration) as f64,
+            seconds_left,
         }
     }
 

@@ -3,6 +3,7 @@
 
 use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};
+use crate::activity::Activity;
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::measure::Side;
 use crate::playable;
@@ -15,7 +16,9 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Held-out views of which both images are shown.
-const VIEWS: usize = 4;
+pub(crate) const VIEWS: usize = 4;
+/// Folder of a compressed run with images of what was removed, named as the held-out views.
+pub(crate) const REMOVED: &str = "removed";
 
 /// The content of `compress.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -41,6 +44,8 @@ pub struct Compressed {
     /// Attempts of a search for a size.
     pub tried: Vec<Tried>,
     pub warnings: Vec<String>,
+    /// Which Gaussians are active when: of the source, and of the file's scene. `None`: all are, at all times.
+    pub activity: [Option<Activity>; 2],
 }
 
 /// One stage of the work.
@@ -136,6 +141,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
             ("PSNR over size, all trials, dB", tried(&compressed.tried)),
         ],
     );
+    activity(out, &compressed);
     both_pictures(out, run, &compressed);
     settings(out, &compressed.settings);
 }
@@ -288,6 +294,41 @@ fn tried(tried: &[Tried]) -> Option<String> {
     Some(format!("{curve}<p class=\"note\">{}</p>", escape(&trials.join(" · "))))
 }
 
+/// What active sets save: what rests in each frame, what frames have in common, and how long Gaussians last.
+fn activity(out: &mut String, compressed: &Compressed) {
+    let curves = |points: &dyn Fn(&Activity) -> Vec<(f64, f64)>, x: &str| {
+        let sides = ["before", "compressed"].into_iter().zip(&compressed.activity);
+        let series: Vec<Series> =
+            sides.filter_map(|(name, of)| Some(Series { name: name.into(), points: points(of.as_ref()?) })).collect();
+        lines(&series, x, "%")
+    };
+    let percent = |share: f64| 100.0 * share;
+    panels(
+        out,
+        "Gaussians over time",
+        [
+            (
+                "Inactive Gaussians by frame, %",
+                curves(&|a| a.times.iter().copied().zip(a.inactive.iter().map(|s| percent(*s))).collect(), "s"),
+            ),
+            (
+                "What active sets of two frames share, % (intersection over union), by the time between them",
+                curves(&|a| a.overlap.iter().map(|[d, share]| (*d, percent(*share))).collect(), "s"),
+            ),
+            ("Time for which Gaussians are active, compressed", lasting(compressed.activity[1].as_ref())),
+        ],
+    );
+}
+
+fn lasting(activity: Option<&Activity>) -> Option<String> {
+    let rows: Vec<(String, f64, String)> = activity?
+        .lasting
+        .iter()
+        .map(|[seconds, share]| (format!("up to {} s", short(*seconds)), *share, format!("{:.1} %", 100.0 * share)))
+        .collect();
+    bars(&rows, 0.0, "shares of the Gaussians")
+}
+
 /// Held-out views as the source shows them, as the file does, and where they differ.
 fn both_pictures(out: &mut String, run: &Run, compressed: &Compressed) {
     let Some((before, after)) = Run::open(&compressed.source).ok().and_then(|r| r.pictures()).zip(run.pictures())
@@ -299,9 +340,10 @@ fn both_pictures(out: &mut String, run: &Run, compressed: &Compressed) {
         let file = &run.views[i].file;
         let [a, b] = [&before, &after].map(|folder| folder.join("renders").join(file));
         let Some(difference) = pictures::difference(&a, &b) else { continue };
-        let both = [pictures::inline(&a), pictures::inline(&b), Some(difference)];
+        let removed = pictures::inline(&run.path.join(REMOVED).join(file));
+        let all = [pictures::inline(&a), pictures::inline(&b), Some(difference), removed];
         shown.push_str("<div class=\"view\">");
-        for (picture, caption) in both.iter().zip(["before", "compressed", "difference"]) {
+        for (picture, caption) in all.iter().zip(["before", "compressed", "difference", "removed Gaussians alone"]) {
             let Some(picture) = picture else { continue };
             let _ = write!(
                 shown,
@@ -314,7 +356,8 @@ fn both_pictures(out: &mut String, run: &Run, compressed: &Compressed) {
         let _ = write!(
             out,
             "<h2>Before and after</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Difference: mean of \
-             the channels, from 0 (dark) to {} of full scale or more (bright).</p>\n",
+             the channels, from 0 (dark) to {} of full scale or more (bright). Removed Gaussians: on black, as they were \
+             when they were removed.</p>\n",
             pictures::DIFFERENCE_WORDS
         );
     }

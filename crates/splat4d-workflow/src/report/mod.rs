@@ -7,7 +7,7 @@ pub mod compare;
 pub mod compress;
 #[cfg(feature = "import")]
 pub mod doctor;
-mod pictures;
+pub(crate) mod pictures;
 #[cfg(feature = "dynamics")]
 pub mod predict;
 mod refined;

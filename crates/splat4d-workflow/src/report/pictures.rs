@@ -85,7 +85,7 @@ fn orbit(run: &Path) -> Option<PathBuf> {
 }
 
 /// `count` indices spread evenly over 0..n, the first and last among them.
-pub(super) fn spread(n: usize, count: usize) -> Vec<usize> {
+pub(crate) fn spread(n: usize, count: usize) -> Vec<usize> {
     match n.min(count) {
         0 => Vec::new(),
         1 => vec![0],

@@ -33,6 +33,15 @@ fn told(source: &Path) -> Compressed {
             Tried { prune: 0.5, bytes: 1 << 20, psnr: 30.95 },
         ],
         warnings: vec!["the <orb> is thin.".into()],
+        activity: [
+            None,
+            Some(Activity {
+                times: vec![0.0, 0.5, 1.0],
+                inactive: vec![0.25, 0.5, 0.75],
+                overlap: vec![[0.5, 0.8], [1.0, 0.3]],
+                lasting: vec![[0.5, 0.125], [1.0, 0.875]],
+            }),
+        ],
     }
 }
 
@@ -62,6 +71,9 @@ fn the_section_shows_before_after_images_and_settings() {
     let text = serde_json::to_string_pretty(&told).unwrap();
     assert_eq!(serde_json::from_str::<Compressed>(&text).unwrap(), told);
     std::fs::write(after.path().join(FILE), text).unwrap();
+    assert!(!page(after.path()).contains("removed Gaussians alone"), "nothing was drawn");
+    std::fs::create_dir(after.path().join(REMOVED)).unwrap();
+    RgbImage::from_pixel(32, 24, image::Rgb([9; 3])).save(after.path().join(REMOVED).join("00000.png")).unwrap();
     let html = page(after.path());
     for text in [
         "level 2",
@@ -77,11 +89,14 @@ fn the_section_shows_before_after_images_and_settings() {
         "2:00",
         "50 % pruned",
         "palette = 4096",
+        "Inactive Gaussians by frame",
+        "up to 0.5 s",
+        "87.5 %",
     ] {
         assert!(html.contains(text), "{text} is missing in {html}");
     }
     assert!(!html.contains("plain file") && !html.contains("flicker"), "what was not measured is not there");
-    assert_eq!(html.matches("data:image/jpeg;base64,").count(), 3, "before, compressed, difference");
+    assert_eq!(html.matches("data:image/jpeg;base64,").count(), 4, "before, compressed, difference, removed");
     assert!(!html.contains("NaN") && !html.contains("inf"));
     let whole = std::fs::read_to_string(super::super::write(&Run::open(after.path()).unwrap()).unwrap()).unwrap();
     for text in [
