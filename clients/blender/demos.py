@@ -18,8 +18,8 @@ def build(name, last):
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end, scene.frame_current = 1, FRAMES, 1
     scene.render.fps, scene.render.fps_base = FPS, 1
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 640, 480, 100
-    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 64, False, False
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 320, 240, 100
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 32, False, False
     scene.view_settings.exposure = 0
     world = bpy.data.worlds.new("World")
     scene.world = world

@@ -304,7 +304,7 @@ class BlenderCapture(InFolder):
             ((out, "--blend", self.folder / "damaged.blend"), "Blender does not open it"),
             ((out, "--blend", empty), "no surface that a camera can see"),
             ((self.folder / "out2", "--blend", cube, "--rig", "scene"), "the scene has no camera"),
-            ((out, "--demo", "tabel"), "expected robot or table"),
+            ((out, "--demo", "desk"), "expected robot or table"),
             ((out, "--demo", "table", "--frames", 5, 4), "no frame is left"),
             ((out, "--demo", "table", "--step", 0), "invalid --step"),
             ((out, "--demo", "table", "--size", 4, 4), "invalid --size"),
