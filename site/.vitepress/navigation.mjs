@@ -24,6 +24,7 @@ const TUTORIALS = [
 const GUIDES = [
   ['docs/filming', 'Film and import'],
   ['docs/assist', 'Align cameras by hand'],
+  ['docs/blender', 'Render a capture in Blender'],
   ['docs/fix-capture', 'Fix a bad capture'],
   ['docs/choose-model', 'Choose a motion model'],
   ['docs/gpu', 'Use a GPU'],

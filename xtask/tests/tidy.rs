@@ -404,8 +404,9 @@ fn flags_in_documents_exist() {
     let mut known = declared_flags();
     assert!(known.contains("--motion") && known.contains("--slow-motion"), "the command's flags are read: {known:?}");
     known.extend(FOREIGN_FLAGS.map(str::to_owned));
-    // The chores and the example script have flags of their own.
-    for path in files("xtask/src", "rs").into_iter().chain(files("examples", "py")) {
+    // The chores and the scripts have flags of their own.
+    let scripts = files("examples", "py").into_iter().chain(files("clients/blender", "py"));
+    for path in files("xtask/src", "rs").into_iter().chain(scripts) {
         known.extend(flags_in(&read(&path)));
     }
     let mut troubles = Vec::new();

@@ -9,6 +9,8 @@ export const CHANNEL_NAMES = { color: 'Colour', depth: 'Depth', alpha: 'Alpha', 
 export const SPEEDS = [0.1, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4];
 const SCALES = [['auto', 'Automatic'], [1, 'Full'], [0.75, '75 %'], [0.5, '50 %'], [0.25, '25 %']];
 const BACKENDS = [['auto', 'Automatic'], ['webgpu', 'WebGPU'], ['webgl2', 'WebGL2']];
+/** Title of the controls of time in a scene without one. */
+const STATIC = 'The scene is static';
 const BACKGROUNDS = { scene: null, black: [0, 0, 0], grey: [0.5, 0.5, 0.5], white: [1, 1, 1] };
 
 const KEYS = [
@@ -84,7 +86,9 @@ export function viewPanel(ui) {
     figures.checked = ui.figuresOn;
     for (const item of [path.children[0], path.children[1], speed, loop]) {
       item.disabled = player.still;
-      if (player.still) item.title = 'The scene is static';
+      // Every file begins static, until its clip is known.
+      if (player.still) item.title = STATIC;
+      else if (item.title === STATIC) item.title = '';
     }
   };
   return node;

@@ -315,6 +315,8 @@ test('every control has a name, and the keyboard reaches it', options, async () 
       .map(n => n.outerHTML));
     assert.deepEqual(nameless, []);
   }
+  const titles = await ask(e => [...e.shadowRoot.querySelectorAll('[title]')].map(n => n.title));
+  assert.ok(!titles.includes('The scene is static'), 'controls of a scene that moves');
   const tree = await page.locator('splat-4d').ariaSnapshot();
   for (const part of ['application "Scene: Two knights"', 'toolbar "Playback"', 'slider "Time"', 'button "Play"',
     'button "Loop"', 'combobox "Speed"', 'radiogroup "Channel"', 'radio "Depth"', 'button "Cameras and paths"',
