@@ -30,6 +30,7 @@ const GUIDES = [
   ['docs/gpu', 'Use a GPU'],
   ['docs/scale', 'Train long captures'],
   ['docs/refine', 'Refine cameras, localise images'],
+  ['docs/shutters', 'Rolling shutter, blur, exposure'],
   ['docs/priors', 'Add depth, flow, tracks'],
   ['docs/evaluate', 'Measure and compare runs'],
   ['docs/render', 'Render images and films'],

@@ -2,13 +2,13 @@
 
 use crate::capture::{self, CAMERAS};
 use crate::scene::FRAMES;
-use crate::{long, photos, still, videos, world};
+use crate::{film, long, photos, still, videos, world};
 use anyhow::{Context, Result, bail};
 use std::path::Path;
 
 /// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
-/// `capture --world NAME FOLDER`, `capture --long SECONDS FOLDER [--size WxH] [--cameras N] [--scene hall|yard]` and
-/// `capture --photos VIEWS FOLDER [--size WxH]`.
+/// `capture --world NAME FOLDER`, `capture --long SECONDS FOLDER [--size WxH] [--cameras N] [--scene hall|yard]`,
+/// `capture --photos VIEWS FOLDER [--size WxH]` and `capture --film FAULTS FOLDER [--size WxH]`.
 pub(crate) fn command(arguments: &[String]) -> Result<()> {
     let home = capture::bundled_folder();
     match arguments {
@@ -32,11 +32,12 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         }
         [flag, seconds, folder, options @ ..] if flag == "--long" => long::command(seconds, Path::new(folder), options),
         [flag, views, folder, options @ ..] if flag == "--photos" => photos::command(views, Path::new(folder), options),
+        [flag, faults, folder, options @ ..] if flag == "--film" => film::command(faults, Path::new(folder), options),
         [flag, folder] if flag == "--videos" => videos::command(Path::new(folder)),
         [] => capture::write(&home, &home, false),
         [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),
         _ => bail!(
-            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is needed, and a folder, --long with seconds and a folder, or --photos with a number and a folder"
+            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is needed, and a folder, --long with seconds and a folder, --film with faults and a folder, or --photos with a number and a folder"
         ),
     }
 }

@@ -13,6 +13,7 @@ mod captures;
 mod chaos;
 mod count;
 mod files;
+mod film;
 mod fuzz;
 mod glb;
 mod light;
@@ -68,6 +69,9 @@ chores:
   capture --long SECONDS FOLDER [--size WxH] [--cameras N]
                              draws a take of any length, 30 frames a second, with images of any size (default 200x150) from N cameras \
                      (default 20); a frame in memory at a time
+  capture --film FAULTS FOLDER [--size WxH]
+                             draws the scene with ground-truth poses and cameras that are not ideal: FAULTS are rolling (a shutter of
+                             30 ms), blur (exposures of 1/40 s) and drift (of exposure and white balance), joined by commas, or none
   strip-character IN.glb OUT.glb CLIP... \
                      [--drop NODE...]
                              keeps the named animation clips of a character, \

@@ -8,6 +8,7 @@ use crate::scene::{BACK, FRONT, Frame, SIDE};
 use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
 use crate::yard_materials;
+use std::ops::Range;
 
 /// A rendered image.
 pub(crate) struct Picture {
@@ -30,7 +31,7 @@ const _: () = assert!(SUPERSAMPLING == 3);
 pub(crate) fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
     let pixels = camera.width * camera.height;
     let mut out = Picture { rgb: Vec::with_capacity(3 * pixels), mask: Vec::with_capacity(pixels) };
-    each_pixel(textures, frame, camera, seen, |color, moving| {
+    each_pixel(textures, frame, camera, seen, 0..camera.height, |color, moving| {
         out.rgb.extend(color.array().map(srgb_from_linear));
         out.mask.push(if moving > 0.5 { 255 } else { 0 });
     });
@@ -41,7 +42,7 @@ pub(crate) fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, see
 /// per pixel.
 pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Vec<u8> {
     let mut out = Vec::with_capacity(4 * camera.width * camera.height);
-    each_pixel(textures, frame, camera, seen, |color, covered| {
+    each_pixel(textures, frame, camera, seen, 0..camera.height, |color, covered| {
         let own = if covered > 0.0 { color * (1.0 / covered) } else { V3::default() };
         out.extend(own.array().map(srgb_from_linear));
         out.push((255.0 * covered).round() as u8);
@@ -49,20 +50,34 @@ pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, s
     out
 }
 
-/// Shades every sample, filters the samples to pixels and returns each pixel's linear colour (nothing is black) and the
+/// Linear colour of the pixels of some rows, black where nothing is seen.
+pub(crate) fn light(
+    textures: [&Texture; 2],
+    frame: &Frame,
+    camera: &Camera,
+    seen: &Visibility,
+    lines: Range<usize>,
+) -> Vec<V3> {
+    let mut out = Vec::with_capacity(camera.width * lines.len());
+    each_pixel(textures, frame, camera, seen, lines, |color, _| out.push(color));
+    out
+}
+
+/// Shades every sample of some rows, filters the samples to pixels and returns each pixel's linear colour (nothing is black) and the
 /// share that moving objects cover, rows from the top.
 fn each_pixel(
     textures: [&Texture; 2],
     frame: &Frame,
     camera: &Camera,
     seen: &Visibility,
+    lines: Range<usize>,
     mut emit: impl FnMut(V3, f64),
 ) {
     // Rows of samples already filtered across; only those about the current pixel row are kept.
     let mut rows: Vec<Vec<(V3, f64)>> = vec![Vec::new(); LENS.len()];
     let mut samples = SampleShader { frame, camera, seen, textures, edges: EdgeCache::default() };
-    let mut next = 0;
-    for y in 0..camera.height {
+    let mut next = (lines.start * SUPERSAMPLING + SUPERSAMPLING / 2).saturating_sub(REACH);
+    for y in lines {
         let middle = y * SUPERSAMPLING + SUPERSAMPLING / 2;
         while next < (middle + REACH + 1).min(seen.height) {
             rows[next % LENS.len()] = samples.filtered_row(next);

@@ -331,7 +331,7 @@ fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
     type Has = fn(&Frame) -> bool;
     let kinds: [(&str, Has); 3] =
-        [("depth", |f| f.depth.is_some()), ("flow", Frame::has_flow), ("tracks", |f| f.tracks.is_some())];
+        [("depth", |f| f.depth.is_some()), ("flow", |f| f.flow.is_some()), ("tracks", |f| f.tracks.is_some())];
     let counted = kinds.map(|(name, has)| (name, count(has)));
     counted.iter().filter(|(_, n)| *n > 0).map(|(name, n)| format!("{name} of {}", grouped(*n))).collect()
 }

@@ -176,6 +176,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             features: None,
             tracks: None,
             recorded: None,
+            shutter: None,
             mask: None,
         }
     };

@@ -120,10 +120,11 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
                 1e3 * seconds,
                 1e3 * sigma
             );
-            let words = (
-                "Fast motion leans, and differently in each view.",
-                "Film at a higher rate: it reads its rows faster.",
+            let remedy = format!(
+                "Give it \"readout\": {seconds:.4} in capture.json: training then renders every row at its own time. A \
+                 higher frame rate reads rows faster."
             );
+            let words = ("Fast motion leans, and differently in each view.", remedy.as_str());
             FindingList { report }.add((g, "rolling-shutter"), Some(name), (1e3 * seconds, "ms"), what, words);
         }
     }

@@ -8,7 +8,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawCapture, RawFrame,
     Rig, Split, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig};
+use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
 use rayon::prelude::*;
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
@@ -67,10 +67,15 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     let flows = flows(&mut take.frames);
     let firsts = std::mem::take(&mut take.firsts);
     let frames = take.frames.into_iter().zip(flows);
-    let frames: Vec<Frame> = frames
+    let mut frames: Vec<Frame> = frames
         .zip(turned)
-        .map(|((raw, flow), upright)| Frame { flow, upright, ..finish(raw, options.downscale) })
+        .map(|((raw, flow), upright)| {
+            let shutter = options.shutter(raw.shutter);
+            Frame { flow, upright, shutter, ..finish(raw, options.downscale) }
+        })
         .collect();
+    shutter::find_motion(&mut frames, &cameras);
+    take.notes.extend(shutter::notes(&frames));
     let name = take.name.unwrap_or_else(|| {
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
@@ -185,6 +190,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         features: raw.features,
         tracks: raw.tracks,
         recorded: None,
+        shutter: None,
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::depth::{self, DepthKind};
 use super::evidence::Agreement;
+use super::shutter::Shutter;
 use super::tracks::Tracks;
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};
@@ -20,6 +21,8 @@ pub struct Picture {
     pub depth: Option<Depth>,
     /// Its optical flow, where known.
     pub flow: Option<Flow>,
+    /// Its shutter, where that is not ideal.
+    pub shutter: Option<Shutter>,
 }
 
 /// Known depth of an image, for a loss.

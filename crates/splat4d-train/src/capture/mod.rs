@@ -44,6 +44,7 @@ mod preflight;
 mod rgb8;
 mod rig;
 mod sequence;
+pub(crate) mod shutter;
 mod splits;
 mod store;
 mod stray;
@@ -65,6 +66,7 @@ pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid,
 pub use preflight::{Finding, Reach};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;
+pub use shutter::Shutter;
 pub use store::{ImageStore, Picture, StoredPicture};
 pub use tracks::Tracks;
 
@@ -164,13 +166,8 @@ pub struct Frame {
     pub tracks: Option<Arc<Tracks>>,
     /// [height · width] of the image file: 1 where its lens recorded something, 0 in black borders; `None`: no borders.
     pub recorded: Option<Arc<Vec<u8>>>,
-}
-
-impl Frame {
-    /// Whether its optical flow is known.
-    pub fn has_flow(&self) -> bool {
-        self.flow.is_some()
-    }
+    /// Its rolling shutter and exposure; `None`: all rows are of its time.
+    pub shutter: Option<Shutter>,
 }
 
 /// One camera of the rig, or one moving camera.
@@ -343,6 +340,8 @@ struct RawFrame {
     labels: Option<PathBuf>,
     features: Option<PathBuf>,
     tracks: Option<Arc<Tracks>>,
+    /// Readout and exposure, seconds, as stated.
+    shutter: [Option<f64>; 2],
     split: Split,
 }
 
@@ -361,6 +360,7 @@ impl RawFrame {
             labels: None,
             features: None,
             tracks: None,
+            shutter: [None; 2],
             split: Split::Train,
         }
     }

@@ -1,6 +1,7 @@
 //! Options of a capture next to its path.
 
 use super::convention::Poses;
+use super::shutter::{self, Shutter};
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
 use std::collections::BTreeMap;
@@ -193,6 +194,14 @@ settings! {
         first_frame: usize = 0 => any().unit("frames");
         /// RGBA images are composited on white; false: on black.
         white_background: bool = true;
+        /// Rows are rendered at their own times where cameras have a readout time.
+        rolling_shutter: bool = true;
+        /// Readout time of cameras that state none, from the first row to the last; negative: from the last.
+        readout: f64 = 0.0 => any().unit("seconds").when(On("capture.rolling_shutter"));
+        /// Renders that are averaged over the exposure of an image; 1: motion blur is not modelled.
+        subframes: usize = 1 => at_least(1);
+        /// Exposure time of cameras that state none.
+        exposure_time: f64 = 0.0 => any().unit("seconds");
     }
 }
 
@@ -236,6 +245,13 @@ pub struct CaptureOptions {
     pub frames: Vec<Range<usize>>,
     /// Known properties of the lenses, from another part of the capture; else images are examined.
     pub lenses: Lenses,
+    /// Readout time of cameras that state none, seconds from the first row to the last; `None`: readout times are
+    /// ignored.
+    pub readout: Option<f64>,
+    /// Exposure time of cameras that state none, seconds.
+    pub exposure: f64,
+    /// Renders that are averaged over an exposure; 1: motion blur is not modelled.
+    pub subframes: usize,
 }
 
 /// Share of the images that may be missing by default: a few were deleted; more is probably another folder.
@@ -278,6 +294,9 @@ impl Default for CaptureOptions {
             max_missing: MAX_MISSING,
             frames: Vec::new(),
             lenses: Lenses::default(),
+            readout: Some(0.0),
+            exposure: 0.0,
+            subframes: 1,
         }
     }
 }
@@ -286,6 +305,12 @@ impl CaptureOptions {
     /// Whether an image with this frame number is to be listed.
     pub(super) fn lists(&self, index: usize) -> bool {
         self.frames.is_empty() || self.frames.iter().any(|f| f.contains(&index))
+    }
+
+    /// The shutter of an image whose readout and exposure are stated so.
+    pub(super) fn shutter(&self, [readout, exposure]: [Option<f64>; 2]) -> Option<Shutter> {
+        let readout = self.readout.map_or(0.0, |others| readout.unwrap_or(others));
+        Shutter::new(readout, exposure.unwrap_or(self.exposure), self.subframes)
     }
 
     /// An error for values that mean nothing: downscale 0, fps ≤ 0, a background outside 0 to 1.
@@ -303,6 +328,8 @@ impl CaptureOptions {
                 Error::input(format!("near is {}", self.near)).remedy("Give a share of the extent from 0 to below 1.")
             );
         }
+        shutter::checked("readout", self.readout.unwrap_or(0.0))?;
+        shutter::checked("exposure_time", self.exposure)?;
         if self.background.is_some_and(|b| b.iter().any(|v| !(0.0..=1.0).contains(v))) {
             return Err(Error::input("the background is outside [0,1]").remedy("Give three numbers from 0 to 1."));
         }

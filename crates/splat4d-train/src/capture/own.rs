@@ -5,7 +5,9 @@ use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_cloud;
-use super::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawCapture, RawFrame, Tracks, pose};
+use super::{
+    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawCapture, RawFrame, Tracks, pose, shutter,
+};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -47,6 +49,8 @@ const CAMERA_KEYS: &[&str] = &[
     "world_to_camera",
     "camera_to_world",
     "time_offset",
+    "readout",
+    "exposure_time",
     "times",
     "images",
     "masks",
@@ -262,6 +266,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         vec![context.pose(&poses, inverted)?]
     };
     let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
+    let shutter = [read_shutter(node, "readout")?, read_shutter(node, "exposure_time")?];
     let times = node.opt("times")?.map(|n| read_times(&n)).transpose()?;
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
@@ -354,6 +359,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             flow: beside(&flow)?,
             labels: beside(&labels)?,
             features: beside(&features)?,
+            shutter,
             ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
@@ -421,6 +427,12 @@ fn read_times(node: &Node<'_>) -> Result<Vec<f64>> {
         return Err(node.error(what).remedy("Give the times in seconds, in the order of the images."));
     }
     Ok(times)
+}
+
+/// A camera's readout or exposure time, seconds.
+fn read_shutter(node: &Node<'_>, key: &str) -> Result<Option<f64>> {
+    let read = |n: Node<'_>| shutter::checked(key, n.number()?).map_err(|e| n.at(e));
+    node.opt(key)?.map(read).transpose()
 }
 
 fn read_lens(node: &Node<'_>) -> Result<Lens> {

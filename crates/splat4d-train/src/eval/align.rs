@@ -100,6 +100,7 @@ impl Align {
                     tracks: None,
                     frame: place,
                     rig: frame.camera,
+                    shutter: frame.shutter,
                 };
                 let progress = step as f64 / steps as f64;
                 let now = StepInfo { iteration: step, times: vec![t], seed: 0, progress };

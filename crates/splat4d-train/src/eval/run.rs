@@ -28,6 +28,7 @@ use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
 use crate::run::corrected;
+use crate::step::shutter::{self, Taken};
 use crate::train_state::{EXPOSURE_COLUMNS, expose};
 use crate::{Error, ErrorKind, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -398,9 +399,18 @@ impl<'a> Judge<'a> {
         let stored = self.store.load(frame)?;
         let (info, mut truth) = (&capture.frames[frame], Planes::default());
         stored.color_into(&mut truth);
-        self.scene.at(info.time, &mut self.instant);
-        let splats = self.scene.splats(&self.instant);
-        self.backend.render(&Shot::new(&splats, &info.view, self.scene.background), &mut self.image)?;
+        let (scene, backend) = (self.scene, self.backend.as_mut());
+        match &info.shutter {
+            None => {
+                scene.at(info.time, &mut self.instant);
+                let splats = scene.splats(&self.instant);
+                backend.render(&Shot::new(&splats, &info.view, scene.background), &mut self.image)?;
+            }
+            Some(shutter) => {
+                let taken = Taken { camera: &info.view, t: info.time, shutter };
+                shutter::render(scene, taken, &mut self.instant, backend, &mut self.image)?;
+            }
+        }
         let mut image = self.image.color.clone();
         if let Some(row) = self.exposures.get(frame) {
             expose(row, &mut image);

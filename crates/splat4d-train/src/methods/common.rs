@@ -20,6 +20,8 @@ settings! {
         exposure_single: bool = true => any().when(On("appearance.exposure"));
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
+        /// Times at which the exposure of a camera that films is learned; it changes linearly between them. 1: it is constant.
+        exposure_knots: usize = 1 => at_least(1).when(On("appearance.exposure"));
         /// Antialiased mode (opacity compensation).
         antialias: bool = false;
     }

@@ -29,7 +29,7 @@ pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Res
         None => json!({ "poses": false, "focal": false, "times": false, "cameras": [] }),
     };
     if let Some(exposure) = photos {
-        let row = |&rig: &usize| (capture.cameras[rig].name.clone(), json!(exposure.response(rig)));
+        let row = |&rig: &usize| (capture.cameras[rig].name.clone(), json!(exposure.response(rig, Time(0.0))));
         value["exposures"] = exposure.trained().iter().map(row).collect::<Value>();
     }
     write_atomically(&run.join(FILE), format!("{value:#}\n").as_bytes())

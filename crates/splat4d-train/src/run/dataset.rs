@@ -69,6 +69,7 @@ impl Frames for Dataset {
         let frame = self.frames[i];
         let stored = self.store.load(frame)?;
         stored.color_into(&mut out.color);
+        out.shutter = self.capture.frames[frame].shutter;
         fill(&mut out.mask, |plane| stored.mask_into(plane));
         fill(&mut out.weight, |plane| stored.valid_into(plane));
         let mut values = out.depth.take().map(|d| d.values).unwrap_or_default();

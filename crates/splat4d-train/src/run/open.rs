@@ -44,6 +44,9 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
         times: recipe.capture.times,
         unregistered: recipe.capture.unregistered,
         max_missing: recipe.capture.max_missing,
+        readout: recipe.capture.rolling_shutter.then_some(recipe.capture.readout),
+        exposure: recipe.capture.exposure_time,
+        subframes: recipe.capture.subframes,
         ..CaptureOptions::default()
     })
 }
@@ -304,8 +307,10 @@ impl OpenCapture {
         let trained: Vec<usize> =
             trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();
         // A single camera's matrix is its own mean, which stays the identity.
-        let exposure =
-            (c.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
+        let knots = if self.capture.of_photos() { 1 } else { c.appearance.exposure_knots };
+        let cameras = self.capture.cameras.len();
+        let exposure = (c.appearance.exposure && trained.len() > 1)
+            .then(|| Exposure::over_time(cameras, &trained, knots, self.capture.time_range()));
         let settings = Settings {
             seed: plan.seed,
             limits: Limits { cap: c.densify.max_cap, extent: plan.extent, min_opacity: c.densify.min_opacity },

@@ -76,6 +76,7 @@ impl Batch {
                 tracks: tracks.as_ref().map(|f| FlowTruth { to: later(f), ..f.truth() }),
                 frame: i,
                 rig: frames.rig(i),
+                shutter: picture.shutter,
             })
             .collect()
     }

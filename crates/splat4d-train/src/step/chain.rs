@@ -4,6 +4,7 @@
 //! distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
+use super::shutter::{self, Average, Exposed, Share, Taken};
 use crate::Result;
 use crate::loss::image::{Channel, LossGrads, Shown};
 pub(crate) use crate::loss::image::{ImageTerm, View};
@@ -14,7 +15,7 @@ use splat4d::backward::sh_grads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
 use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
-use splat4d::scene::{Grads, Rows, Space, Table, Time};
+use splat4d::scene::{Grads, Rows, Space, Splats, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Times of a step's parts.
@@ -84,6 +85,7 @@ pub(crate) struct Losses<'a, F: Real> {
 pub(crate) struct Chain<F: Real = f32> {
     evaluation: Evaluation<F>,
     picture: Compared<F>,
+    exposed: Exposed<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
 }
@@ -140,7 +142,10 @@ impl<F: Real> Chain<F> {
         report.timings.loss += lap(&mut clock);
         self.evaluation.backward(&scene.layers, d);
         report.timings.motion_backward = lap(&mut clock);
-        report.d_times.extend(views.iter().map(|view| self.evaluation.d_time(view.t)));
+        let d_time = |view: &View<'_, F>| -> f64 {
+            shutter::times(view.t, view.shutter.as_ref()).map(|t| self.evaluation.d_time(t)).sum()
+        };
+        report.d_times.extend(views.iter().map(d_time));
         self.at_calls = self.evaluation.len();
         Ok(report)
     }
@@ -149,8 +154,10 @@ impl<F: Real> Chain<F> {
     fn request(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
         self.evaluation.begin();
         for view in step.views {
-            for (index, layer) in step.scene.layers.iter().enumerate() {
-                self.evaluation.request_active(index, layer, view.t);
+            for t in shutter::times(view.t, view.shutter.as_ref()) {
+                for (index, layer) in step.scene.layers.iter().enumerate() {
+                    self.evaluation.request_active(index, layer, t);
+                }
             }
         }
         for probe in probes.iter().flatten() {
@@ -166,6 +173,8 @@ impl<F: Real> Chain<F> {
                 }
             }
         }
+        let exposed: Vec<_> = step.views.iter().filter_map(|view| Some((view.t, view.shutter?))).collect();
+        shutter::align(&mut self.evaluation, step.scene.layers.len(), &exposed);
     }
 
     /// By layer the query for its Gaussians at a time of this step.
@@ -182,34 +191,69 @@ impl<F: Real> Chain<F> {
         let source = Source { scene, view, asked: &asked };
         let needs = work.image.needs(view);
         let channels = Channels::new(&needs.extra, source, &self.evaluation);
-        let splats = self.evaluation.splats(scene, view.t);
-        let shot = Shot {
-            extra: channels.as_ref().map(|c| &c.table),
-            sh_degree: step.sh_degree,
-            depth: needs.depth,
-            ..Shot::new(&splats, view.camera, view.background)
-        };
-        let target = if channels.is_none() && !needs.depth { work.image.target(view) } else { None };
-        let compared = match target {
-            Some(target) => self.picture.compare_there(view, &shot, &target, work)?,
-            None => false,
-        };
+        let (taken, layers) = (Taken::of(view), scene.layers.len());
+        let n = view.shutter.map_or(1, |shutter| shutter.subframes);
+        let look =
+            Look { view, sh_degree: step.sh_degree, depth: needs.depth, extra: channels.as_ref().map(|c| &c.table) };
+        let target = if n == 1 && channels.is_none() && !needs.depth { work.image.target(view) } else { None };
+        let mut compared = false;
+        for k in 0..n {
+            if let Some(taken) = taken {
+                self.exposed.expose(&self.evaluation, layers, taken, k);
+            }
+            let splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            let shot = look.shot(&splats);
+            compared = match &target {
+                Some(target) => self.picture.compare_there(view, &shot, target, work)?,
+                None => false,
+            };
+            if !compared {
+                self.picture.render(&shot, [k, n], work)?;
+            }
+        }
         if !compared {
-            work.backend.render(&shot, &mut self.picture.image)?;
             work.report.timings.render += lap(&mut clock);
             self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
             work.report.timings.loss += lap(&mut clock);
-            self.picture.backward(&shot, work)?;
         }
-        work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
-        work.report.d_cameras.push(self.picture.d_splats.camera);
-        work.report.d_focals.push(self.picture.d_splats.focal);
-        self.picture.report_visibility(&self.evaluation, &asked, work);
-        drop(splats);
-        self.picture.d_splats.add_to(scene, view.t, &mut self.evaluation, work.d);
-        if let (Some(channels), Some(d_table)) = (&channels, self.picture.d_channels()) {
-            channels.backward(d_table, source, &mut self.evaluation, work.d);
+        let (mut camera, mut focal) = ([0.0; 6], 0.0);
+        for k in (0..n).rev() {
+            // The backend still has the last subframe.
+            let again = k + 1 < n;
+            if let Some(taken) = taken.filter(|_| again) {
+                self.exposed.expose(&self.evaluation, layers, taken, k);
+            }
+            let splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            let shot = look.shot(&splats);
+            if again {
+                work.backend.render(&shot, &mut self.picture.part)?;
+            }
+            if !compared {
+                self.picture.backward(&shot, n, work)?;
+            }
+            work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
+            drop(splats);
+            (0..6).for_each(|i| camera[i] += self.picture.d_splats.camera[i]);
+            focal += self.picture.d_splats.focal;
+            if n > 1 {
+                self.picture.tally(again, work.backend.radii());
+            } else {
+                self.picture.report_visibility(&self.evaluation, &asked, work);
+            }
+            let d_splats = &mut self.picture.d_splats;
+            match taken {
+                None => d_splats.add_to(scene, view.t, &mut self.evaluation, work.d),
+                Some(taken) => self.exposed.backward(d_splats, scene, taken, &mut self.evaluation, work.d),
+            }
+            if let (Some(channels), Some(d_table)) = (&channels, self.picture.d_channels()) {
+                channels.backward(d_table, source, &mut self.evaluation, work.d);
+            }
         }
+        if n > 1 {
+            self.picture.report_visibility(&self.evaluation, &asked, work);
+        }
+        work.report.d_cameras.push(camera);
+        work.report.d_focals.push(focal);
         work.report.timings.render_backward += lap(&mut clock);
         Ok(())
     }
@@ -252,15 +296,59 @@ impl<F: Real> Chain<F> {
     }
 }
 
+/// What is rendered of a view.
+struct Look<'a, F: Real> {
+    view: &'a View<'a, F>,
+    sh_degree: usize,
+    depth: bool,
+    extra: Option<&'a Table<F>>,
+}
+
+impl<'a, F: Real> Look<'a, F> {
+    fn shot(&self, splats: &'a Splats<'a, F>) -> Shot<'a, F> {
+        let Look { view, sh_degree, depth, extra } = *self;
+        Shot { extra, sh_degree, depth, ..Shot::new(splats, view.camera, view.background) }
+    }
+}
+
 /// An image, and the gradients to it and to its splats.
 #[derive(Default)]
 struct Compared<F> {
     image: Image<F>,
     d_image: LossGrads<F>,
     d_splats: RenderGrads<F>,
+    /// A subframe, where the image is an average of several.
+    part: Image<F>,
+    average: Average<F>,
+    share: Share<F>,
+    /// By splat, over all subframes: sums of [`RenderGrads::mean2d`], and largest radii. Empty: there is one.
+    mean2d: Vec<F>,
+    radii: Vec<F>,
 }
 
 impl<F: Real> Compared<F> {
+    /// Renders subframe k of n.
+    fn render(&mut self, shot: &Shot<'_, F>, [k, n]: [usize; 2], work: &mut Work<'_, F>) -> Result<()> {
+        if n == 1 {
+            return work.backend.render(shot, &mut self.image);
+        }
+        work.backend.render(shot, &mut self.part)?;
+        self.average.add(&mut self.image, &self.part, [k, n]);
+        Ok(())
+    }
+
+    /// Adds what a subframe saw of every splat; `again`: not the first one.
+    fn tally(&mut self, again: bool, radii: &[F]) {
+        if !again {
+            self.mean2d.clone_from(&self.d_splats.mean2d);
+            self.radii.clear();
+            self.radii.extend_from_slice(radii);
+            return;
+        }
+        self.mean2d.iter_mut().zip(&self.d_splats.mean2d).for_each(|(sum, x)| *sum += *x);
+        self.radii.iter_mut().zip(radii).for_each(|(most, x)| *most = most.max(*x));
+    }
+
     /// The image loss and its gradient.
     fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
         self.d_image.begin(&self.image);
@@ -285,23 +373,33 @@ impl<F: Real> Compared<F> {
         Ok(true)
     }
 
-    /// The backend's VJP.
-    fn backward(&mut self, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
+    /// The backend's VJP of one of n subframes.
+    fn backward(&mut self, shot: &Shot<'_, F>, n: usize, work: &mut Work<'_, F>) -> Result<()> {
         let mut d_sh = sh_grads(shot.splats, work.d);
-        work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)
+        let grads = self.d_image.grads();
+        if n == 1 {
+            return work.backend.vjp(shot, &grads, &mut d_sh, &mut self.d_splats);
+        }
+        self.share.take(&grads, &self.part, &self.image, n);
+        work.backend.vjp(shot, &self.share.grads(), &mut d_sh, &mut self.d_splats)
     }
 
     /// Passes to the observer what the view saw of every layer.
-    fn report_visibility(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
+    fn report_visibility(&mut self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
+        let several = !self.radii.is_empty();
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {
             let tape = evaluation.tape(i);
             let splats = first..first + tape.out().rows();
             first = splats.end;
-            let mean2d = &self.d_splats.mean2d[splats.clone()];
-            let radii = &work.backend.radii()[splats];
+            let (mean2d, radii) = match several {
+                true => (&self.mean2d[..], &self.radii[..]),
+                false => (&self.d_splats.mean2d[..], work.backend.radii()),
+            };
+            let (mean2d, radii) = (&mean2d[splats.clone()], &radii[splats]);
             (work.observe)(Observation { layer, rows: tape.rows(), mean2d, radii });
         }
+        self.radii.clear();
     }
 
     /// The gradient to the further channels, if a term has examined them.

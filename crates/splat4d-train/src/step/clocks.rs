@@ -75,7 +75,7 @@ impl OffsetImages<'_> {
                 let splats = scene.splats(&instant);
                 backend.render(&Shot::new(&splats, &camera, scene.background), &mut image)?;
                 if let Some(exposure) = self.exposure {
-                    exposure.respond(self.frames.rig(i), &mut image.color);
+                    exposure.respond(self.frames.rig(i), Time(time(i)), &mut image.color);
                 }
                 *cost += difference(&image.color, &picture);
             }

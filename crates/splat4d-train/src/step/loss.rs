@@ -76,7 +76,7 @@ impl ImageTerm for StepLoss<'_> {
         let run = &mut *self.run;
         let mut shown = *drawn;
         if let Some(exposure) = &self.exposure {
-            exposure.show(view.rig, drawn.color, &mut run.exposed);
+            exposure.show(view.rig, view.t, drawn.color, &mut run.exposed);
             shown.color = &run.exposed;
         }
         let mut total = 0.0;
@@ -89,7 +89,7 @@ impl ImageTerm for StepLoss<'_> {
         }
         run.views += 1;
         if let Some(exposure) = &mut self.exposure {
-            exposure.respond_backward(view.rig, drawn.color, d.color.add());
+            exposure.respond_backward(view.rig, view.t, drawn.color, d.color.add());
         }
         total
     }
@@ -97,7 +97,7 @@ impl ImageTerm for StepLoss<'_> {
     fn target<'a>(&self, view: &View<'a>) -> Option<Target<'a>> {
         let mut terms = self.run.terms.iter().chain(&*self.stage).filter(|term| term.applies_to(view));
         let (Some(only), None) = (terms.next(), terms.next()) else { return None };
-        let response = self.exposure.as_ref().map(|exposure| exposure.response(view.rig));
+        let response = self.exposure.as_ref().map(|exposure| exposure.response(view.rig, view.t));
         only.target(view).map(|target| Target { response, ..target })
     }
 
@@ -113,7 +113,7 @@ impl ImageTerm for StepLoss<'_> {
         }
         run.views += 1;
         if let (Some(exposure), Some(d)) = (&mut self.exposure, &comparison.d_response) {
-            exposure.add_gradient(view.rig, d);
+            exposure.add_gradient(view.rig, view.t, d);
         }
         total
     }
@@ -187,6 +187,7 @@ mod tests {
             tracks: None,
             frame: 0,
             rig: RIG,
+            shutter: None,
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
         let image = Image { color: color.clone(), ..Image::default() };

@@ -10,6 +10,7 @@ pub mod loss;
 pub(crate) mod pace;
 pub mod replans;
 pub(crate) mod resident;
+pub(crate) mod shutter;
 pub mod trainer;
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use super::engine::{
 };
 use crate::loss::terms::ResidentLoss;
 use crate::optim::{GAUSSIANS, corrections};
-use crate::train_state::{Parts, TrainState};
+use crate::train_state::{Exposure, Parts, TrainState};
 use crate::{ErrorKind, Result};
 use splat4d::device::ResidentMotion;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
@@ -194,6 +194,8 @@ fn known(
         (stage.codec.is_some(), "renders use the decoded playback file"),
         (train_state.corrections.is_some(), "cameras are refined"),
         (scene.head_keys().is_some(), "a pixel head is trained"),
+        (train_state.exposure.as_ref().is_some_and(Exposure::changes), "exposures change over time"),
+        (plan.views.iter().any(|v| v.shutter.is_some()), "images have a rolling shutter or motion blur"),
     ];
     if let Some((_, why)) = of_stage.iter().find(|(is, _)| *is) {
         return Err((*why).into());

@@ -1,10 +1,10 @@
-//! [`Exposure`]: learnt colour matrices of the cameras.
+//! [`Exposure`]: learnt colour matrices of the cameras, constant or changing over time.
 
 use crate::capture::Capture;
 use crate::optim::Moments;
 use rayon::prelude::*;
 use splat4d::math::Real;
-use splat4d::scene::{Grads, Key, Params, Planes, Space};
+use splat4d::scene::{Grads, Key, Params, Planes, Space, Time};
 use splat4d::simd::{Kernel, Simd, dispatch, each};
 use std::collections::BTreeSet;
 
@@ -25,13 +25,39 @@ const RUN: usize = 32;
 /// Source: FreeTimeGS++ 2026 (an affine colour correction a camera); the fixed mean is ours.
 #[derive(Debug)]
 pub struct Exposure {
-    /// One table [cameras, 12].
+    /// One table [cameras · times, 12], the times of a camera one after the other.
     pub(crate) params: Params<f32>,
     /// Its moments.
     pub(crate) moments: Moments<f32>,
     key: Key,
     pub(crate) grads: Grads<f32>,
+    /// Rows that learn.
     trained: Vec<usize>,
+    knots: Knots,
+}
+
+/// The times at which a camera's exposure is learnt; between two of them it changes linearly.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Knots {
+    count: usize,
+    /// Seconds of the first one and between two.
+    first: f64,
+    step: f64,
+}
+
+impl Knots {
+    /// The same exposure at all times.
+    const CONSTANT: Self = Self { count: 1, first: 0.0, step: 1.0 };
+
+    /// The rows of a camera at a time, and their shares.
+    fn at(&self, rig: usize, t: Time) -> [(usize, f32); 2] {
+        let last = self.count - 1;
+        let place = ((t.0 - self.first) / self.step).clamp(0.0, last as f64);
+        let before = (place as usize).min(last.saturating_sub(1));
+        let share = (place - before as f64) as f32;
+        let row = rig * self.count + before;
+        [(row, 1.0 - share), (rig * self.count + (before + 1).min(last), share)]
+    }
 }
 
 /// (I + M)x + c.
@@ -121,7 +147,23 @@ impl Exposure {
         let key = params
             .entry("exposure", Space::Fixed, &[("exposure", COLUMNS)], cameras, |_| {})
             .expect("a new table fits itself");
-        Self { moments: Moments::new(&params).rarely_used(), grads: Grads::new(&params), params, key, trained }
+        let (moments, grads) = (Moments::new(&params).rarely_used(), Grads::new(&params));
+        Self { moments, grads, params, key, trained, knots: Knots::CONSTANT }
+    }
+
+    /// The same with `count` exposures of every camera, spread evenly over a time span.
+    pub(crate) fn over_time(cameras: usize, trained: &[usize], count: usize, span: (f64, f64)) -> Self {
+        let step = (span.1 - span.0) / count.saturating_sub(1).max(1) as f64;
+        if count < 2 || step <= 0.0 {
+            return Self::new(cameras, trained.to_vec());
+        }
+        let rows = trained.iter().flat_map(|rig| rig * count..(rig + 1) * count).collect();
+        Self { knots: Knots { count, first: span.0, step }, ..Self::new(cameras * count, rows) }
+    }
+
+    /// Whether exposures change over time.
+    pub(crate) fn changes(&self) -> bool {
+        self.knots.count > 1
     }
 
     /// Those that a run has learnt, by the capture's frames. The training cameras go on.
@@ -139,7 +181,7 @@ impl Exposure {
         self.key
     }
 
-    /// The cameras whose mean is held at the identity.
+    /// The rows whose mean is held at the identity: a camera's number, if exposures do not change over time.
     pub(crate) fn trained(&self) -> &[usize] {
         &self.trained
     }
@@ -155,24 +197,33 @@ impl Exposure {
         self.grads.clear(&self.params);
     }
 
-    /// The row of a camera: its matrix without the identity, row by row, then its offsets.
-    pub(crate) fn response(&self, rig: usize) -> [f32; COLUMNS] {
-        self.params[self.key].read::<COLUMNS>(rig, 0)
+    /// The exposure of a camera at a time: its matrix without the identity, row by row, then its offsets.
+    pub(crate) fn response(&self, rig: usize, t: Time) -> [f32; COLUMNS] {
+        let table = &self.params[self.key];
+        match self.knots.at(rig, t) {
+            [(row, _), (_, 0.0)] => table.read::<COLUMNS>(row, 0),
+            both => {
+                let [a, b] = both.map(|(row, share)| table.read::<COLUMNS>(row, 0).map(|x| share * x));
+                std::array::from_fn(|k| a[k] + b[k])
+            }
+        }
     }
 
-    /// Adds to the gradient of a camera's row.
-    pub(crate) fn add_gradient(&mut self, rig: usize, d: &[f64; COLUMNS]) {
-        self.grads.of([self.key])[0].add(rig, 0, d.map(|x| x as f32));
+    /// Adds to the gradient of a camera's rows at a time.
+    pub(crate) fn add_gradient(&mut self, rig: usize, t: Time, d: &[f64; COLUMNS]) {
+        for (row, share) in self.knots.at(rig, t).into_iter().filter(|(_, share)| *share > 0.0) {
+            self.grads.of([self.key])[0].add(row, 0, d.map(|x| share * x as f32));
+        }
     }
 
-    /// Turns the colours `color` into those that camera `rig` shows.
-    pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        expose(&self.response(rig), color);
+    /// Turns the colours `color` into those that camera `rig` shows at time `t`.
+    pub(crate) fn respond(&self, rig: usize, t: Time, color: &mut Planes<f32>) {
+        expose(&self.response(rig, t), color);
     }
 
-    /// Writes the colours that camera `rig` shows of what was rendered.
-    pub(crate) fn show(&self, rig: usize, drawn: &Planes<f32>, out: &mut Planes<f32>) {
-        let row = self.response(rig);
+    /// Writes the colours that camera `rig` shows at time `t` of what was rendered.
+    pub(crate) fn show(&self, rig: usize, t: Time, drawn: &Planes<f32>, out: &mut Planes<f32>) {
+        let row = self.response(rig, t);
         if (out.channels, out.height, out.width) != (drawn.channels, drawn.height, drawn.width) {
             out.reset(drawn.channels, drawn.height, drawn.width);
         }
@@ -187,8 +238,8 @@ impl Exposure {
 
     /// The VJP of [`respond`](Self::respond) at what was rendered: turns the gradient to the shown colours into that to
     /// the rendered ones, and adds to the camera's.
-    pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
-        let (row, simd) = (self.response(rig), Simd::detect());
+    pub(crate) fn respond_backward(&mut self, rig: usize, t: Time, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
+        let (row, simd) = (self.response(rig, t), Simd::detect());
         let sums: Vec<[f64; COLUMNS]> = pieces(d_color)
             .enumerate()
             .map(|(piece, d)| {
@@ -198,7 +249,7 @@ impl Exposure {
             })
             .collect();
         let sum = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>();
-        self.add_gradient(rig, &std::array::from_fn(sum));
+        self.add_gradient(rig, t, &std::array::from_fn(sum));
     }
 
     /// One Adam step with what the last views gave. Returns whether all was finite.
@@ -249,6 +300,22 @@ mod tests {
         assert_eq!(shown(&[0.0; COLUMNS], x), x, "no row is the identity");
     }
 
+    #[test]
+    fn exposures_that_change_are_lines_between_their_times() {
+        let mut exposure = Exposure::over_time(3, &[0, 2], 4, (1.0, 2.5));
+        assert_eq!((exposure.trained(), exposure.changes()), (&[0, 1, 2, 3, 8, 9, 10, 11][..], true));
+        let key = exposure.key();
+        (0..4).for_each(|k| exposure.params[key].write(8 + k, 0, [(k * k) as f32; COLUMNS]));
+        // Before the first time and after the last one it is theirs.
+        for (t, value) in [(0.0, 0.0), (1.0, 0.0), (1.25, 0.5), (1.5, 1.0), (2.25, 6.5), (2.5, 9.0), (7.0, 9.0)] {
+            assert_eq!(exposure.response(2, Time(t)), [value; COLUMNS], "{t} s");
+        }
+        exposure.add_gradient(2, Time(2.125), &[8.0; COLUMNS]);
+        let rows: Vec<f32> = (0..12).map(|row| exposure.grads.table(key).get(row, 3)).collect();
+        assert_eq!(rows, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 6.0, 2.0]);
+        assert!(!Exposure::over_time(3, &[0, 2], 4, (1.0, 1.0)).changes(), "there is one time");
+    }
+
     /// Every pixel of every piece, with the same bits whatever the threads, and nothing learnt of the cameras' mean.
     #[test]
     fn cameras_differ_from_their_mean_alone() {
@@ -267,11 +334,11 @@ mod tests {
                     let rig = [0, 2, 3][step % 3];
                     let mut d = picture(&format!("gradient {step}"));
                     d.data.iter_mut().for_each(|x| *x -= 0.45);
-                    exposure.respond_backward(rig, &picture("drawn"), &mut d);
+                    exposure.respond_backward(rig, Time(0.0), &picture("drawn"), &mut d);
                     assert!(exposure.step(0.01));
                 }
                 let mut shown = picture("drawn");
-                exposure.respond(2, &mut shown);
+                exposure.respond(2, Time(0.0), &mut shown);
                 let table = &exposure.params[exposure.key()];
                 let rows: Vec<[f32; COLUMNS]> = (0..4).map(|rig| table.read(rig, 0)).collect();
                 (rows, shown)
@@ -293,10 +360,10 @@ mod tests {
         let key = exposure.key();
         exposure.params[key].write(2, 0, rows[2]);
         let (mut out, mut d) = (Planes::default(), picture("gradient 0"));
-        exposure.show(2, &drawn, &mut out);
+        exposure.show(2, Time(0.0), &drawn, &mut out);
         assert_eq!(out, color);
         let before = d.clone();
-        exposure.respond_backward(2, &drawn, &mut d);
+        exposure.respond_backward(2, Time(0.0), &drawn, &mut d);
         let mut sums = [0.0; COLUMNS];
         for p in 0..drawn.pixels() {
             let (d_x, d_row) = shown_backward(&rows[2], at(&drawn, p), at(&before, p));

@@ -388,3 +388,45 @@ fn near_is_a_share_of_the_extent_and_never_hides_points() {
         assert!(error.unwrap_err().to_string().contains("near is"));
     }
 }
+
+#[test]
+fn shutters_of_cameras_are_read_and_moving_cameras_have_their_velocity() {
+    let sample = samples::own();
+    sample.edit("capture.json", |v| {
+        v["cameras"][0]["readout"] = json!(0.02);
+        v["cameras"][0]["exposure_time"] = json!(0.01);
+        v["cameras"][1]["readout"] = json!(0.0);
+    });
+    let of = |capture: &Capture, camera: usize| {
+        let shutter = capture.frames.iter().find(|f| f.camera == camera).unwrap().shutter;
+        shutter.map(|s| (s.readout, s.exposure, s.subframes))
+    };
+    let capture = open(&sample);
+    assert_eq!([0, 1].map(|c| of(&capture, c)), [Some((0.02, 0.0, 1)), None]);
+    assert!(capture.notes.iter().any(|note| note.contains("rolling shutter") && note.ends_with(": 1.")));
+    let options = CaptureOptions { readout: Some(-0.01), subframes: 3, ..CaptureOptions::default() };
+    let capture = open_with(&sample, options.clone());
+    assert_eq!([0, 1].map(|c| of(&capture, c)), [Some((0.02, 0.01, 3)), None], "a stated 0 has priority");
+    let capture = open_with(&sample, CaptureOptions { readout: None, ..options });
+    assert_eq!(of(&capture, 0), Some((0.0, 0.01, 3)));
+    sample.edit("capture.json", |v| v["cameras"][0]["readout"] = json!(20));
+    let refused = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();
+    assert!(refused.contains("readout") && refused.contains("0.02"), "{refused}");
+    // A camera that moves by a tenth along its x axis per frame.
+    sample.edit("capture.json", |v| {
+        let first = v["cameras"][0]["world_to_camera"].clone();
+        let count = v["cameras"][0]["frames"].as_u64().or(v["frames"].as_u64()).unwrap_or(2);
+        let moved = |i: u64| {
+            let mut pose = first.clone();
+            pose[0][3] = json!(first[0][3].as_f64().unwrap() + 0.1 * i as f64);
+            pose
+        };
+        v["cameras"][0]["world_to_camera"] = (0..count).map(moved).collect();
+        v["cameras"][0]["readout"] = json!(0.02);
+    });
+    let capture = open(&sample);
+    for frame in capture.frames.iter().filter(|f| f.camera == 0) {
+        let twist = frame.shutter.unwrap().twist;
+        assert!((twist[0] - 0.1 * capture.fps).abs() < 1e-9 && twist[1..].iter().all(|x| x.abs() < 1e-9), "{twist:?}");
+    }
+}

@@ -227,6 +227,7 @@ fn gradients_of_quantised_values_reach_the_parameters() {
             tracks: None,
             frame: i,
             rig: 0,
+            shutter: None,
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 5, progress: 0.0 };
         let mut d: Vec<Grads<f32>> = whole.layers.iter().map(|l| Grads::new(&l.params)).collect();

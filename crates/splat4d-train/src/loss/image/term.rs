@@ -2,6 +2,7 @@
 //! its truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
+use crate::capture::shutter::Shutter;
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::render::{Comparison, Image, ImageGrads, Target};
@@ -45,6 +46,8 @@ pub struct View<'a, F = f32> {
     pub frame: usize,
     /// The camera's number in the capture, for the exposure.
     pub rig: usize,
+    /// The image's shutter, where that is not ideal.
+    pub shutter: Option<Shutter>,
 }
 
 /// A further channel: a number or a few of every splat, blended as colours are, over nothing. The declared order is the

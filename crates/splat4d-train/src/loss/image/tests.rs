@@ -36,6 +36,7 @@ where
         tracks: None,
         frame: 0,
         rig: 0,
+        shutter: None,
     }
 }
 

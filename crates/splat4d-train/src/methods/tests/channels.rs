@@ -58,6 +58,7 @@ fn run(scene: &Scene<f64>, needs: &Needs, backend: &mut dyn Backend<f64>) -> (f6
             tracks: Some(FlowTruth { to: Time(0.12), camera: &shots[i].camera, vectors: &shots[i].truth }),
             frame: 0,
             rig: 0,
+            shutter: None,
         })
         .collect();
     let info = StepInfo { iteration: 0, times: views.iter().map(|v| v.t).collect(), seed: 0, progress: 0.0 };

@@ -15,6 +15,7 @@ mod nodes;
 mod pruned;
 mod refine;
 mod scan;
+mod shutter;
 mod split;
 mod triple;
 mod wrapper;
@@ -154,6 +155,7 @@ struct Shot {
     camera: Camera,
     t: f64,
     truth: Planes<f64>,
+    shutter: Option<crate::capture::shutter::Shutter>,
 }
 
 /// Images of the synthetic capture, in f64, at times of our choice: (camera, seconds).
@@ -165,7 +167,7 @@ fn shots(list: &[(usize, f64)]) -> Vec<Shot> {
         let truth = &picture.color;
         let data = truth.data.iter().map(|&x| f64::from(x)).collect();
         let truth = Planes { channels: 3, height: truth.height, width: truth.width, data };
-        Shot { camera: made.camera(camera).clone(), t, truth }
+        Shot { camera: made.camera(camera).clone(), t, truth, shutter: None }
     };
     list.iter().map(shot).collect()
 }
@@ -194,6 +196,7 @@ fn step(
             tracks: None,
             frame: 0,
             rig: 0,
+            shutter: s.shutter,
         })
         .collect();
     let info = StepInfo { iteration: 0, times: views.iter().map(|v| v.t).collect(), seed: 0, progress: 0.0 };
@@ -251,7 +254,9 @@ fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<V
         }
         reached.push(tables);
     }
-    if probes.is_empty() {
+    // The gradient to a moving camera's pose neglects that its motion turns with it.
+    let still = |s: &Shot| s.shutter.is_none_or(|s| s.twist == [0.0; 6]);
+    if probes.is_empty() && shots.iter().all(still) {
         for (i, shot) in shots.iter().enumerate() {
             // Views at one time share its derivative: they move together.
             let moved = |by: f64| {

@@ -44,6 +44,7 @@ fn poses_focal_lengths_and_clocks_of_cameras_have_the_gradient_of_the_loss() {
             camera: c.camera(i, &s.camera),
             t: c.time(i, Time(s.t)).0,
             truth: s.truth.clone(),
+            shutter: None,
         };
         stated.iter().enumerate().map(of).collect()
     };

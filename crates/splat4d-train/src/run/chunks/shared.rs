@@ -165,6 +165,8 @@ fn of_medians(recipe: &Recipe) -> Recipe {
         r.capture.hold_out = Some(HoldOut::None);
         (r.capture.first_frame, r.capture.max_frames, r.capture.fps) = (0, 0, 0.0);
         (r.loss.depth, r.loss.flow, r.loss.tracks) = (0.0, 0.0, 0.0);
+        // Medians have no shutter and no time.
+        (r.capture.rolling_shutter, r.capture.subframes, r.appearance.exposure_knots) = (false, 1, 1);
         r.life.kind = None;
         if r.init.source == Source::Hull {
             r.init.source = Source::Auto;

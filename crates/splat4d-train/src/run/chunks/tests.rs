@@ -168,6 +168,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
             tracks: None,
             frame: 0,
             rig: 0,
+            shutter: None,
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
         let mut d = LossGrads::default();

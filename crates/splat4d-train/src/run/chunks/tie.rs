@@ -63,7 +63,7 @@ impl ImageTerm for Tie {
         let shot = Shot::new(&splats, view.camera, view.background);
         self.backend.render(&shot, &mut self.image).expect("the CPU renders every scene");
         if let Some(exposure) = &self.exposure {
-            exposure.respond(view.rig, &mut self.image.color);
+            exposure.respond(view.rig, view.t, &mut self.image.color);
         }
         let pixels = shown.color.pixels();
         let unit = self.weight / shown.color.data.len() as f64;

@@ -87,13 +87,7 @@ fn a_flickering_copy_of_the_background_is_pruned_and_the_image_stays() {
         truth.layers[0].params[LIFE].write(r, 0, [0.4, 3f32.ln()]);
     }
     let frames = made();
-    let picture = |i: usize| Picture {
-        color: drawn(&truth, &frames, i).color,
-        mask: None,
-        weight: None,
-        depth: None,
-        flow: None,
-    };
+    let picture = |i: usize| Picture { color: drawn(&truth, &frames, i).color, ..Picture::default() };
     let pictures = (0..frames.len()).map(picture).collect();
     let frames = Arc::new(Drawn { frames, pictures });
 
