@@ -98,8 +98,8 @@ pub fn open_exr_layers(planes: &[(String, &[f32])], size: [usize; 2], comments: 
 fn open_exr_of(planes: &[(String, &[f32])], [w, h]: [usize; 2], encoding: Encoding, comments: &str) -> Result<Vec<u8>> {
     let one = |(name, plane): &(String, &[f32])| AnyChannel::new(name.as_str(), FlatSamples::F32(plane.to_vec()));
     let channels = AnyChannels::sort(planes.iter().map(one).collect());
-    let mut attributes = LayerAttributes::default();
-    attributes.comments = Text::new_or_none(comments).filter(|_| !comments.is_empty());
+    let comments = Text::new_or_none(comments).filter(|_| !comments.is_empty());
+    let attributes = LayerAttributes { comments, ..LayerAttributes::default() };
     let layer = Layer::new((w, h), attributes, encoding, channels);
     let mut out = Cursor::new(Vec::new());
     let written = Image::from_layer(layer).write().non_parallel().to_buffered(&mut out);

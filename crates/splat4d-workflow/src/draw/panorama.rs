@@ -221,13 +221,13 @@ mod tests {
     #[test]
     fn a_turn_shifts_the_sphere_across_all_seams() {
         // 15 degrees: half of what is between two views.
-        let mut panorama = Panorama::new(384);
+        let mut panorama = Panorama::new(192);
         let (still, turned) = (sphere(&mut panorama, 0.0), sphere(&mut panorama, TAU / 24.0));
         let [w, h] = panorama.size();
-        let row = |row: &[f32]| [&row[16..], &row[..16]].concat();
+        let row = |row: &[f32]| [&row[8..], &row[..8]].concat();
         let shifted: Vec<f32> = still.color.data.chunks(w).flat_map(row).collect();
         let likeness = psnr(&shifted, &turned.color.data);
-        assert!(likeness > 40.0, "{likeness}");
+        assert!(likeness > 39.0, "{likeness}");
         assert!(psnr(&still.color.data, &turned.color.data) < 30.0, "the scene differs from direction to direction");
         // Across the seam of longitude columns differ as little as elsewhere.
         let step = |a: usize, b: usize| -> f32 {

@@ -466,11 +466,11 @@ fn exr(light: &Light, layers: &Layers, transfer: Transfer, labels: &[String]) ->
     planes.push(("Z".into(), layers.depth.plane(0)));
     planes.push(("forward.u".into(), layers.motion.plane(0)));
     planes.push(("forward.v".into(), &up));
-    let mut comments = format!("colours times alpha, {}", transfer.about());
+    let mut comments = format!("Colours are times alpha. {}", transfer.about());
     if layers.label.channels > 0 {
         planes.push(("label".into(), layers.label.plane(0)));
         let names: Vec<String> = labels.iter().enumerate().map(|(i, name)| format!("{i} {name}")).collect();
-        comments = format!("{comments}; labels: {}", names.join(", "));
+        comments = format!("{comments}. Labels: {}", names.join(", "));
     }
     open_exr_layers(&planes, [color.width, color.height], &comments)
 }
