@@ -18,13 +18,13 @@ use splat4d::render::{Abilities, Image, RenderConfig, Shot, Tables};
 use splat4d::scene::{Planes, Time};
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::converting::{self, Conversion};
-use splat4d_workflow::draw::{Channel, Painter, antialias};
+use splat4d_workflow::draw::{Channel, Painter, Transfer, antialias};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
 use splat4d_workflow::exporting::{self, Frames, TrackOptions};
 use splat4d_workflow::localising::{LocaliseOptions, localise};
 use splat4d_workflow::paths::{Route, View};
-use splat4d_workflow::rendering::{self as films, RenderOptions};
+use splat4d_workflow::rendering::{self as films, Focus, Photo, Projection, RenderOptions, Stereo};
 use splat4d_workflow::sequence::timestamps;
 use splat4d_workflow::source::{Source, not_empty, read_scene};
 use std::cell::RefCell;
@@ -465,10 +465,14 @@ impl Scene {
 
     /// Films a camera path through space and time (docs/render.md): an .mp4 where ffmpeg is installed, an animated
     /// .png, or a folder of images. `route`: "orbit", "train", "test", "camera=NAME" or a key-frame file. `start` and
-    /// `end` are seconds of the scene; `freeze` stops time there.
+    /// `end` are seconds of the scene; `freeze` stops time there. `shutter`: degrees; `aperture`: diameter of the lens;
+    /// `focus`: a distance or a pixel (x, y); `samples`: images per frame; `projection`: "perspective" or
+    /// "equirectangular"; `stereo`: "side-by-side" or "over-under", with `eye_distance`; `transparent`: PNG files with
+    /// alpha; `transfer`: "linear" or "srgb" colours of .exr files.
     #[pyo3(signature = (
         path, *, route=None, size=None, start=None, end=None, freeze=None, slow_motion=None, seconds=None, fps=None,
-        channel="color", force=false, device="cpu"
+        channel="color", shutter=None, aperture=None, focus=None, samples=None, projection="perspective", stereo=None,
+        eye_distance=None, transparent=false, transfer=None, force=false, device="cpu"
     ))]
     #[allow(clippy::too_many_arguments)]
     fn film(
@@ -484,10 +488,19 @@ impl Scene {
         seconds: Option<f64>,
         fps: Option<f64>,
         channel: &str,
+        shutter: Option<f64>,
+        aperture: Option<f64>,
+        focus: Option<&Bound<'_, PyAny>>,
+        samples: Option<usize>,
+        projection: &str,
+        stereo: Option<&str>,
+        eye_distance: Option<f64>,
+        transparent: bool,
+        transfer: Option<&str>,
         force: bool,
         device: &str,
     ) -> PyResult<()> {
-        let numbers = [start, end, freeze, slow_motion, seconds, fps];
+        let numbers = [start, end, freeze, slow_motion, seconds, fps, shutter, aperture, eye_distance];
         if numbers.into_iter().flatten().any(|v| !v.is_finite()) {
             return Err(bad_input("a number is not finite", "Give seconds, a factor or frames per second"));
         }
@@ -507,6 +520,17 @@ impl Scene {
             seconds,
             fps,
             channel,
+            photo: Photo {
+                shutter,
+                aperture,
+                focus: focus.map(focused).transpose()?,
+                samples,
+                projection: one_of(&Projection::ALL, Projection::name, projection, "projection")?,
+                stereo: stereo.map(|s| one_of(&Stereo::ALL, Stereo::name, s, "stereo layout")).transpose()?,
+                eye_distance,
+                transparent,
+                transfer: transfer.map(|t| one_of(&Transfer::ALL, Transfer::name, t, "transfer")).transpose()?,
+            },
             force,
             device: named(device)?,
             ..RenderOptions::default()
@@ -603,6 +627,22 @@ pub(crate) struct Tracks {
     /// [M] the row of each in its layer.
     #[pyo3(get)]
     rows: Py<PyAny>,
+}
+
+/// The value of this name.
+fn one_of<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, given: &str, what: &str) -> PyResult<T> {
+    all.iter().copied().find(|one| name(*one) == given).ok_or_else(|| {
+        let names: Vec<&str> = all.iter().map(|one| name(*one)).collect();
+        bad_input(format!("there is no {what} `{given}`"), &format!("Give one of {}", names.join(", ")))
+    })
+}
+
+/// A distance, or a pixel.
+fn focused(focus: &Bound<'_, PyAny>) -> PyResult<Focus> {
+    let distance = focus.extract::<f64>().map(Focus::Distance);
+    distance
+        .or_else(|_| focus.extract::<[f64; 2]>().map(Focus::Pixel))
+        .map_err(|_| bad_input("`focus` is neither a distance nor a pixel", "Give a number of scene units, or (x, y)"))
 }
 
 /// The device with this name.

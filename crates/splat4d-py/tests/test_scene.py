@@ -109,6 +109,12 @@ class Scenes(InFolder):
         self.assertEqual(splat4d.info(PLAYABLE)["type"], "playback")
         self.scene.film(self.folder / "film", size=(16, 12), fps=1, seconds=1)
         self.assertTrue((self.folder / "film" / "00000.png").is_file())
+        self.scene.film(self.folder / "c.%02d.exr", size=(16, 12), fps=1, seconds=2, shutter=180, aperture=0.1, focus=4)
+        self.assertTrue((self.folder / "c.01.exr").read_bytes().startswith(b"\x76\x2f\x31\x01"))
+        with self.assertRaisesRegex(splat4d.Error, "up to 360"):
+            self.scene.film(self.folder / "d.png", shutter=720)
+        with self.assertRaisesRegex(splat4d.Error, "over-under"):
+            self.scene.film(self.folder / "d.png", stereo="crossed", eye_distance=0.1)
         count = self.scene.export_frames(self.folder / "frames", fps=2)
         self.assertEqual(count, len(list((self.folder / "frames").glob("frame_*.ply"))))
         self.scene.export_tracks(self.folder / "near.csv", near=[0, 0, 1], count=2, fps=1)

@@ -1,5 +1,10 @@
 //! Interface to the renderer: renders a scene, a camera and a time as an image for display.
 
+mod exposing;
+mod layers;
+mod panorama;
+mod transfer;
+
 use crate::events::Listener;
 use crate::paths::View;
 use crate::source::cloud;
@@ -13,6 +18,11 @@ use splat4d::render::{Abilities, Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
 use splat4d::{Error, Result};
 use splat4d_train::labels::best;
+
+pub use exposing::{Course, Exposure, Light};
+pub use layers::Layers;
+pub use panorama::Panorama;
+pub use transfer::Transfer;
 
 /// Channel of the rendering that is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -147,15 +157,20 @@ pub struct Rgb {
 impl Rgb {
     /// The bytes of a PNG file.
     pub fn png(&self) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
-        encoder.set_color(png::ColorType::Rgb);
-        encoder.set_depth(png::BitDepth::Eight);
-        encoder.set_compression(png::Compression::Fast);
-        let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(&self.data);
-        write(encoder).expect("an image in memory can be encoded");
-        bytes
+        png_of(&self.data, [self.width, self.height], png::ColorType::Rgb)
     }
+}
+
+/// The bytes of a PNG file of 8-bit samples.
+fn png_of(data: &[u8], [width, height]: [usize; 2], color: png::ColorType) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width as u32, height as u32);
+    encoder.set_color(color);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Fast);
+    let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(data);
+    write(encoder).expect("an image in memory can be encoded");
+    bytes
 }
 
 /// Renders, on the CPU by default; memory is reused from image to image.
@@ -177,6 +192,29 @@ pub struct Painter<'a> {
     instant: Evaluation<f32>,
     /// Of the last image: the channel's values and the weight of what has one.
     field: (Planes<f32>, Planes<f32>),
+    /// Images are of the whole sphere, if there is one.
+    panorama: Option<Panorama>,
+}
+
+/// Renders a shot, or the sphere around its camera. A device that fails is reported, and the CPU takes over.
+fn shoot(
+    backend: &mut Box<dyn Backend>,
+    listener: Option<&dyn Listener>,
+    panorama: &mut Option<Panorama>,
+    shot: &Shot<'_>,
+    out: &mut Image,
+) {
+    let mut pinhole = |shot: &Shot<'_>, out: &mut Image| {
+        if let Some(error) = device::draw(backend, shot, out)
+            && let Some(listener) = listener
+        {
+            listener.warn(&format!("rendering on the CPU: {}", error.cause()));
+        }
+    };
+    match panorama {
+        None => pinhole(shot, out),
+        Some(panorama) => panorama.render(shot, &mut pinhole, out),
+    }
 }
 
 impl<'a> Painter<'a> {
@@ -199,7 +237,21 @@ impl<'a> Painter<'a> {
             numbers: Vec::new(),
             instant: Evaluation::default(),
             field: Default::default(),
+            panorama: None,
         }
+    }
+
+    /// The same with images of the whole sphere.
+    pub fn around(mut self, panorama: Option<Panorama>) -> Self {
+        self.panorama = panorama;
+        self
+    }
+
+    /// As players do: what is beyond the clip of spans is its end.
+    fn scene_time(&self, time: f64) -> Time {
+        let scene = self.scene;
+        let spans = scene.layers.iter().any(|l| l.span != ALWAYS);
+        Time(if spans { time.max(scene.clip[0]).min(scene.clip[1]) } else { time })
     }
 
     /// The same for images of this channel. `views`: the training images' cameras, from which uncertainty is computed.
@@ -254,6 +306,11 @@ impl<'a> Painter<'a> {
         self
     }
 
+    /// Names of the scene's labels.
+    pub fn labels(&self) -> &[String] {
+        &self.scene.labels
+    }
+
     /// The device's name.
     pub fn device(&self) -> &str {
         self.backend.name()
@@ -266,19 +323,13 @@ impl<'a> Painter<'a> {
         }
         let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
         let shot = Shot { depth: self.depth, ..Shot::new(&splats, camera, self.background) };
-        if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
-            && let Some(listener) = self.listener
-        {
-            listener.warn(&format!("rendering on the CPU: {}", error.cause()));
-        }
+        shoot(&mut self.backend, self.listener, &mut self.panorama, &shot, &mut self.image);
     }
 
     /// Renders the means of the channel's numbers into `field`.
     fn draw_field(&mut self, camera: &Camera, time: f64) {
         let scene = self.scene;
-        // As players do: what is beyond the clip of spans is its end.
-        let spans = scene.layers.iter().any(|l| l.span != ALWAYS);
-        let t = Time(if spans { time.max(scene.clip[0]).min(scene.clip[1]) } else { time });
+        let t = self.scene_time(time);
         scene.at(t, &mut self.instant);
         let columns = match self.channel {
             Channel::Flow => {
@@ -295,11 +346,7 @@ impl<'a> Painter<'a> {
         };
         let splats = scene.splats(&self.instant);
         let shot = Shot { extra: Some(&columns), ..Shot::new(&splats, camera, self.background) };
-        if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
-            && let Some(listener) = self.listener
-        {
-            listener.warn(&format!("rendering on the CPU: {}", error.cause()));
-        }
+        shoot(&mut self.backend, self.listener, &mut self.panorama, &shot, &mut self.image);
         self.field = flow::divided(&self.image.extra);
     }
 
@@ -343,7 +390,7 @@ impl<'a> Painter<'a> {
     /// Renders and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
     /// [`rgb`](Self::rgb).
     pub fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
-        if channel == Channel::Color {
+        if channel == Channel::Color && self.panorama.is_none() {
             let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
             let shot = Shot::new(&splats, camera, self.background);
             // A device that fails is left by what follows.

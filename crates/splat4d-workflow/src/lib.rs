@@ -34,7 +34,7 @@
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
 //! | `sound.rs` | sound of captures, runs and files: converted, cut |
 //! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
-//! | `device.rs`, `draw.rs`, `video.rs`, `raw_values.rs`, `rendering.rs` | renders a scene's channels as images, films, arrays |
+//! | `device.rs`, `draw.rs`, `draw/`, `video.rs`, `raw_values.rs`, `rendering.rs`, `rendering/` | renders a scene's channels as images, films, arrays; shutter, lens, spheres, layers for compositing |
 //! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |

@@ -1,7 +1,10 @@
 //! The numbers behind images as files: NumPy arrays, Middlebury flow, OpenEXR.
 
 use crate::draw::Channel;
-use exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage};
+use exr::prelude::{
+    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes, LineOrder,
+    Text, WritableImage,
+};
 use splat4d::scene::Planes;
 use splat4d::{Error, Result, format};
 use std::io::Cursor;
@@ -77,15 +80,30 @@ impl RawFormat {
     }
 }
 
-/// A single-part OpenEXR file of uncompressed scan lines, which every reader takes.
+/// A single-part OpenEXR file of one channel's planes.
 fn open_exr(channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
-    let one = |c: usize| AnyChannel::new(channel.plane(c).as_str(), FlatSamples::F32(raw.plane(c).to_vec()));
-    let channels = AnyChannels::sort((0..raw.channels).map(one).collect());
-    let layer = Layer::new((raw.width, raw.height), LayerAttributes::default(), Encoding::UNCOMPRESSED, channels);
+    let planes: Vec<(String, &[f32])> = (0..raw.channels).map(|c| (channel.plane(c), raw.plane(c))).collect();
+    open_exr_of(&planes, [raw.width, raw.height], Encoding::UNCOMPRESSED, "")
+        .map_err(|e| e.remedy("Use option `raw_format` npy."))
+}
+
+/// A single-part OpenEXR file of named planes, compressed without loss; `comments`: text for people.
+pub fn open_exr_layers(planes: &[(String, &[f32])], size: [usize; 2], comments: &str) -> Result<Vec<u8>> {
+    let zip =
+        Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
+    open_exr_of(planes, size, zip, comments)
+}
+
+/// A single-part OpenEXR file of scan lines, which every reader takes.
+fn open_exr_of(planes: &[(String, &[f32])], [w, h]: [usize; 2], encoding: Encoding, comments: &str) -> Result<Vec<u8>> {
+    let one = |(name, plane): &(String, &[f32])| AnyChannel::new(name.as_str(), FlatSamples::F32(plane.to_vec()));
+    let channels = AnyChannels::sort(planes.iter().map(one).collect());
+    let comments = Text::new_or_none(comments).filter(|_| !comments.is_empty());
+    let attributes = LayerAttributes { comments, ..LayerAttributes::default() };
+    let layer = Layer::new((w, h), attributes, encoding, channels);
     let mut out = Cursor::new(Vec::new());
-    Image::from_layer(layer).write().non_parallel().to_buffered(&mut out).map_err(|e| {
-        Error::input(format!("an image cannot be written as OpenEXR ({e})")).remedy("Use option `raw_format` npy.")
-    })?;
+    let written = Image::from_layer(layer).write().non_parallel().to_buffered(&mut out);
+    written.map_err(|e| Error::input(format!("an image cannot be written as OpenEXR ({e})")))?;
     Ok(out.into_inner())
 }
 

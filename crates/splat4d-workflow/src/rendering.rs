@@ -1,5 +1,9 @@
 //! Images and films of a run, a scene file or a plain 3DGS .ply.
 
+mod photo;
+
+pub use photo::{Focus, MAX_SAMPLES, Photo, Projection, Stereo};
+
 use crate::device;
 use crate::draw::{Channel, Painter};
 use crate::events::Listener;
@@ -9,11 +13,14 @@ use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use crate::video::{self, Film};
 use crate::{camera_file, files};
+use photo::{Studio, Written};
 use splat4d::device::Device;
 use splat4d::format::playback::Sound;
+use splat4d::layers::Scene;
 use splat4d::scene::Planes;
 use splat4d::{Error, Result, format};
 use splat4d_train::output::OutputFolder;
+use std::cell::Cell;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -60,6 +67,8 @@ pub struct RenderOptions {
     pub raw: Option<PathBuf>,
     /// Format of the raw values.
     pub raw_format: RawFormat,
+    /// Shutter, lens, projection, eyes and transparency.
+    pub photo: Photo,
     /// Replace numbered files that splat4d wrote to the folder.
     pub force: bool,
     /// Device that renders.
@@ -82,6 +91,7 @@ impl Default for RenderOptions {
             background: None,
             raw: None,
             raw_format: RawFormat::Npy,
+            photo: Photo::default(),
             force: false,
             device: Device::Auto,
         }
@@ -99,26 +109,49 @@ pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Lis
             Error::input("no output was given").remedy("Add option `output` NAME.png, option `raw` NAME or both.")
         );
     };
-    if args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
-        return Err(Error::input("one image is written as .png")
+    let exr = args.output.as_deref().is_some_and(photo::is_exr);
+    if !exr && args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
+        return Err(Error::input("one image is written as .png or .exr")
             .at(output.display())
-            .remedy("Use option `output` NAME.png."));
+            .remedy("Use option `output` NAME.png or NAME.exr."));
     }
     args.raw_format.suits(args.channel)?;
+    let size = [camera.width, camera.height];
+    args.photo.check(&RenderOptions { size: Some(size), ..args.clone() })?;
     let source = Source::open(path)?;
     let raw = args.raw.as_deref().map(|prefix| raw_files(prefix, args)).unwrap_or_default();
     let outputs: Vec<&Path> = args.output.iter().chain(&raw).map(PathBuf::as_path).collect();
     source.keep_all(path, &outputs, &[camera_file])?;
+    args.photo.check_output(output, args, &source.scene)?;
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.or(background).unwrap_or(source.scene.background);
     let painter = Painter::new(&source.scene, background, antialias(&source), depth);
     let mut painter = channel(painter, args, &source, console)?;
-    painter.draw(&camera, args.freeze.unwrap_or(source.scene.clip[0]));
+    painter = painter.around(args.photo.panorama(size));
+    let shot = paths::Shot { camera, time: args.freeze.unwrap_or(source.scene.clip[0]) };
+    painter.draw(&shot.camera, shot.time);
     if let Some(out) = &args.output {
         let range = painter.range().unwrap_or(NO_RANGE);
-        files::write(out, &painter.rgb(args.channel, range).png())?;
+        let plain = args.photo == Photo::default();
+        let bytes = match (exr && args.channel != Channel::Color, exr || !plain) {
+            (true, _) => RawFormat::Exr.bytes(args.channel, &painter.raw())?,
+            (_, false) => painter.rgb(args.channel, range).png(),
+            (_, true) => {
+                let shots = [shot.clone()];
+                let studio = studio(args, &source.scene, &shots, true, source.scene.fps, range);
+                let written = studio.write(&mut painter, 0)?;
+                // Raw values are those of the plain image.
+                painter.draw(&shot.camera, shot.time);
+                match written {
+                    Written::Rgb(rgb) => rgb.png(),
+                    Written::File(bytes) => bytes,
+                }
+            }
+        };
+        files::write(out, &bytes)?;
         console.written(out);
     }
+    let camera = &shot.camera;
     match &raw[..] {
         [] => {}
         [color, alpha, depth] => {
@@ -208,6 +241,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
         video::check(out)?;
     }
     args.raw_format.suits(args.channel)?;
+    args.photo.check(args)?;
     let source = Source::open(path)?;
     let scene = &source.scene;
     not_empty(scene, path)?;
@@ -233,10 +267,15 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
         .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1])));
     }
     let stage = source.stage(&views);
-    let shots = shots(&route, &clock, &views, &stage, args.size)?;
+    let around = args.photo.projection == Projection::Equirectangular;
+    let mut shots = shots(&route, &clock, &views, &stage, args.photo.size(args.size))?;
+    if around {
+        shots.iter_mut().for_each(|shot| shot.camera = photo::level(&shot.camera, scene.up));
+    }
     let output = args.output.clone().unwrap_or_else(|| default_output(path, &route, source.run.is_some()));
     let keys = if let Route::Keys(file) = &route { vec![file.as_path()] } else { Vec::new() };
     source.keep(path, &output, &keys)?;
+    args.photo.check_output(&output, args, scene)?;
     let size = [shots[0].camera.width, shots[0].camera.height];
     if let Some(other) = shots.iter().find(|s| [s.camera.width, s.camera.height] != size)
         && output.extension().is_some()
@@ -249,7 +288,8 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     }
     let background = args.background.unwrap_or(scene.background);
     let depth = args.channel == Channel::Depth;
-    let mut painter = channel(Painter::new(scene, background, antialias(&source), depth), args, &source, console)?;
+    let painter = channel(Painter::new(scene, background, antialias(&source), depth), args, &source, console)?;
+    let mut painter = painter.around(args.photo.panorama(size));
     let plain = matches!(args.channel, Channel::Color | Channel::Alpha | Channel::Normal | Channel::Label);
     let range = if plain { NO_RANGE } else { range(&mut painter, &shots) };
     if args.output.is_none()
@@ -257,15 +297,30 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     {
         files::make_folder(folder)?;
     }
+    let written = photo::files_of(&output, args.photo.transparent, shots.len())?;
     let owned = folders(args, &output, shots.len(), &sequence::Read { path, run: source.run.as_ref() })?;
     let sound = sound_of(&source, &shots, clock.fps, &output, console);
-    let mut film = Film::create(&output, size, clock.fps, shots.len(), sound)?;
+    let mut film = match written {
+        Some(files) => Film::files(files)?,
+        None => Film::create(&output, args.photo.written_size(size), clock.fps, shots.len(), sound)?,
+    };
+    let exr = photo::is_exr(&output);
+    let views = matches!(route, Route::Test | Route::Train);
+    let studio = studio(args, scene, &shots, views, if views { scene.fps } else { clock.fps }, range);
     let mut drawing = Duration::ZERO;
     for (i, shot) in shots.iter().enumerate() {
         let start = Instant::now();
-        let picture = painter.picture(&shot.camera, shot.time, args.channel, range);
+        let frame = if exr && args.channel != Channel::Color {
+            painter.draw(&shot.camera, shot.time);
+            Written::File(RawFormat::Exr.bytes(args.channel, &painter.raw())?)
+        } else {
+            studio.write(&mut painter, i)?
+        };
         drawing += start.elapsed();
-        film.frame(&picture)?;
+        match frame {
+            Written::Rgb(rgb) => film.frame(&rgb)?,
+            Written::File(bytes) => film.file(&bytes)?,
+        }
         if let Some(raw) = &args.raw {
             if args.channel == Channel::Color {
                 // What takes over 8 bits alone leaves no numbers behind.
@@ -297,6 +352,21 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     Ok(output)
 }
 
+/// What shots are rendered with. `views`: they are not frames of one camera's film.
+fn studio<'s>(
+    args: &'s RenderOptions,
+    scene: &Scene<f32>,
+    shots: &'s [paths::Shot],
+    views: bool,
+    fps: f64,
+    range: [f32; 2],
+) -> Studio<'s> {
+    let exr = args.channel == Channel::Color && args.output.as_deref().is_some_and(photo::is_exr);
+    let frame = 1.0 / if fps > 0.0 { fps } else { FPS };
+    let (photo, channel, clip) = (&args.photo, args.channel, scene.clip);
+    Studio { photo, channel, shots, views, clip, frame, range, exr, focus: Cell::new(None) }
+}
+
 /// The scene's sound, and the second at which the film begins; none where the film has none, which a line reports.
 fn sound_of<'a>(
     source: &'a Source,
@@ -324,7 +394,7 @@ fn sound_of<'a>(
 
 /// Takes the folders of frames: of images, where the output is not a single file, and of numbers.
 fn folders(args: &RenderOptions, output: &Path, count: usize, read: &sequence::Read<'_>) -> Result<Vec<OutputFolder>> {
-    let pictures = output.extension().is_none().then(|| Pattern::plain(output, "png"));
+    let pictures = Pattern::of(output).or_else(|| output.extension().is_none().then(|| Pattern::plain(output, "png")));
     let numbers = args.raw.as_deref().map(|raw| Pattern::plain(raw, args.raw_format.ending()));
     let place = |p: &Pattern| p.folder().canonicalize().or_else(|_| std::path::absolute(p.folder())).ok();
     let all: Vec<&Pattern> = pictures.iter().chain(&numbers).collect();

@@ -2,6 +2,7 @@
 
 use crate::draw::Rgb;
 use crate::files::{self, cannot_write};
+use crate::sequence::Pattern;
 use splat4d::format::playback::Sound;
 use splat4d::{Error, Result};
 use splat4d_train::output::Staged;
@@ -16,8 +17,7 @@ const CRF: &str = "18";
 const AUDIO: &str = "160k";
 const SAMPLES: f64 = 48_000.0;
 /// File name endings that films may have.
-const ENDINGS: &str =
-    "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
+const ENDINGS: &str = "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), NAME.%04d.png or NAME.%04d.exr (numbered), or a name without extension for a folder of images.";
 /// Remedy where ffmpeg is missing.
 const INSTEAD: &str = "Install ffmpeg, or write an animated .png or a folder of images instead (option `output` NAME.png, option `output` FOLDER).";
 /// What is in the folder in which ffmpeg works: the film and its sound.
@@ -55,6 +55,13 @@ pub enum Film {
         /// Writes frames one by one.
         writer: Box<png::Writer<BufWriter<File>>>,
     },
+    /// Numbered files with names that were given: one image each.
+    Files {
+        /// The files.
+        files: Vec<PathBuf>,
+        /// Number of frames.
+        next: usize,
+    },
     /// Numbered PNGs.
     Folder {
         /// The folder.
@@ -85,6 +92,14 @@ impl Film {
             }
             _ => Err(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS)),
         }
+    }
+
+    /// Starts a film of one file per frame, whose folder is made.
+    pub fn files(files: Vec<PathBuf>) -> Result<Self> {
+        if let Some(folder) = files.first().and_then(|f| f.parent()).filter(|p| !p.as_os_str().is_empty()) {
+            files::make_folder(folder)?;
+        }
+        Ok(Self::Files { files, next: 0 })
     }
 
     fn ffmpeg(
@@ -175,10 +190,23 @@ impl Film {
             Self::Apng { writer, output } => {
                 writer.write_image_data(&picture.data).map_err(|e| full(output.path(), e))?
             }
+            Self::Folder { .. } | Self::Files { .. } => self.file(&picture.png())?,
+        }
+        Ok(())
+    }
+
+    /// Adds a frame as the bytes of its file. Panics: the film is a single file.
+    pub fn file(&mut self, bytes: &[u8]) -> Result<()> {
+        match self {
             Self::Folder { path, next } => {
-                files::write(&path.join(format!("{next:05}.png")), &picture.png())?;
+                files::write(&path.join(format!("{next:05}.png")), bytes)?;
                 *next += 1;
             }
+            Self::Files { files, next } => {
+                files::write(&files[*next], bytes)?;
+                *next += 1;
+            }
+            _ => panic!("the frames of a single file have no bytes of their own"),
         }
         Ok(())
     }
@@ -201,7 +229,7 @@ impl Film {
                 writer.finish().map_err(|e| full(output.path(), e))?;
                 output.keep()?;
             }
-            Self::Folder { .. } => {}
+            Self::Folder { .. } | Self::Files { .. } => {}
         }
         Ok(())
     }
@@ -241,7 +269,9 @@ pub fn check(path: &Path) -> Result<()> {
             .at(path.display())
             .remedy(INSTEAD));
     }
-    if !matches!(ending.as_str(), "" | "png" | "apng" | "mp4" | "mkv" | "mov") {
+    if !matches!(ending.as_str(), "" | "png" | "apng" | "exr" | "mp4" | "mkv" | "mov")
+        || Pattern::of(path).is_some() && !matches!(ending.as_str(), "png" | "exr")
+    {
         return Err(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS));
     }
     Ok(())

@@ -3,10 +3,10 @@
 use crate::console::Console;
 use crate::device::Device;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use splat4d_workflow::draw::Channel;
+use splat4d_workflow::draw::{Channel, Transfer};
 use splat4d_workflow::paths::{Route, parse_size};
 use splat4d_workflow::raw_values::RawFormat;
-use splat4d_workflow::rendering::{RenderOptions, film, image};
+use splat4d_workflow::rendering::{Focus, Photo, Projection, RenderOptions, Stereo, film, image};
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -20,10 +20,13 @@ Examples:
   splat4d render runs/knight --channel flow --path camera=cam03 -o flow/ --raw flow/ --raw-format flo
   splat4d render runs/knight --channel uncertainty -o unsure.mp4
   splat4d render scene.ply --camera cam.json -o view.png --raw view
+  splat4d render runs/knight --shutter 180 --aperture 0.1 -o blurred.mp4
+  splat4d render runs/knight --projection equirectangular --size 4096x2048 -o sphere.mp4
+  splat4d render runs/knight --path camera=cam03 --shutter 180 -o comp/shot.%04d.exr
   splat4d render runs/knight --device gpu -v               on the GPU; prints frames/s
 
-The output's extension selects the format: .mp4 (needs ffmpeg), .png (animated if it has several frames), none: a folder \
-of PNGs. A key frame file is
+The output's extension selects the format: .mp4 (needs ffmpeg), .png (animated if it has several frames), .exr, none: a \
+folder of PNGs. NAME.%04d.png and NAME.%04d.exr are numbered files. A key frame file is
   {\"fps\": 30, \"keys\": [{\"time\": 0, \"position\": [0, 1, 4], \"look_at\": [0, 1, 0], \"fov_y\": 45, \"scene_time\": 0},
                        {\"time\": 3, \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}
 and a camera file
@@ -38,7 +41,7 @@ pub(crate) struct Args {
     /// The run, scene file or .ply
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
-    /// Output: NAME.mp4, NAME.png, or a folder
+    /// Output: NAME.mp4, NAME.png, NAME.exr, NAME.%04d.png, NAME.%04d.exr, or a folder
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
     /// Camera path: orbit, test, train, camera=NAME or a key frame file [default: orbit]
@@ -76,6 +79,33 @@ pub(crate) struct Args {
     /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
     #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Image")]
     background: Option<Color>,
+    /// Shutter angle, degrees up to 360: motion blur of the scene and the camera around the frame's time
+    #[arg(long, value_name = "DEGREES", value_parser = number, help_heading = "Photography")]
+    shutter: Option<f64>,
+    /// Diameter of the lens in scene units: depth of field
+    #[arg(long, value_name = "D", value_parser = number, help_heading = "Photography")]
+    aperture: Option<f64>,
+    /// What is sharp: a distance in scene units, or a pixel X,Y [default: the middle of the image]
+    #[arg(long, value_name = "Z|X,Y", value_parser = focus, help_heading = "Photography", allow_negative_numbers = true)]
+    focus: Option<Focus>,
+    /// Images of which a blurred one is the mean [default: 8, with a lens 16]
+    #[arg(long, value_name = "N", help_heading = "Photography")]
+    samples: Option<usize>,
+    /// How directions become pixels
+    #[arg(long, value_parser = projections(), default_value = "perspective", help_heading = "Photography")]
+    projection: Projection,
+    /// Images of two eyes, each of the image's size
+    #[arg(long, value_parser = stereos(), requires = "eye_distance", help_heading = "Photography")]
+    stereo: Option<Stereo>,
+    /// Distance of the eyes in scene units; 0.065 where a unit is one metre
+    #[arg(long, value_name = "D", value_parser = number, requires = "stereo", help_heading = "Photography")]
+    eye_distance: Option<f64>,
+    /// PNG files with alpha in place of the background
+    #[arg(long, conflicts_with = "background", help_heading = "Image")]
+    transparent: bool,
+    /// Colours of .exr files [default: linear]
+    #[arg(long, value_parser = transfers(), help_heading = "Image")]
+    transfer: Option<Transfer>,
     /// Also write the raw values. With --camera: P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w] (Σ zαT), not
     /// clamped, and those of another --channel as P.CHANNEL.npy. Of a film: the channel's as numbered files in P
     #[arg(long, value_name = "P", help_heading = "Image")]
@@ -104,6 +134,27 @@ fn raw_formats() -> impl TypedValueParser<Value = RawFormat> {
     PossibleValuesParser::new(values).map(move |name| named(name).expect("it is one of the names"))
 }
 
+/// Reads the name of a projection.
+fn projections() -> impl TypedValueParser<Value = Projection> {
+    let values = Projection::ALL.map(|one| PossibleValue::new(one.name()).help(one.about()));
+    let named = |name: String| Projection::ALL.into_iter().find(|one| one.name() == name);
+    PossibleValuesParser::new(values).map(move |name| named(name).expect("it is one of the names"))
+}
+
+/// Reads the name of a stereo layout.
+fn stereos() -> impl TypedValueParser<Value = Stereo> {
+    let values = Stereo::ALL.map(|one| PossibleValue::new(one.name()).help(one.about()));
+    let named = |name: String| Stereo::ALL.into_iter().find(|one| one.name() == name);
+    PossibleValuesParser::new(values).map(move |name| named(name).expect("it is one of the names"))
+}
+
+/// Reads the name of a transfer function.
+fn transfers() -> impl TypedValueParser<Value = Transfer> {
+    let values = Transfer::ALL.map(|one| PossibleValue::new(one.name()).help(one.about()));
+    let named = |name: String| Transfer::ALL.into_iter().find(|one| one.name() == name);
+    PossibleValuesParser::new(values).map(move |name| named(name).expect("it is one of the names"))
+}
+
 /// Reads the name of a channel.
 fn channels() -> impl TypedValueParser<Value = Channel> {
     let values = Channel::ALL.map(|channel| PossibleValue::new(channel.name()).help(channel.about()));
@@ -126,6 +177,17 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         background: args.background,
         raw: args.raw.clone(),
         raw_format: args.raw_format,
+        photo: Photo {
+            shutter: args.shutter,
+            aperture: args.aperture,
+            focus: args.focus,
+            samples: args.samples,
+            projection: args.projection,
+            stereo: args.stereo,
+            eye_distance: args.eye_distance,
+            transparent: args.transparent,
+            transfer: args.transfer,
+        },
         force: args.force,
         device: args.device.into(),
     };
@@ -138,6 +200,15 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 
 fn number(text: &str) -> Result<f64, String> {
     text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "expected a number".to_owned())
+}
+
+fn focus(text: &str) -> Result<Focus, String> {
+    let parts: Result<Vec<f64>, String> = text.split(',').map(number).collect();
+    match parts.as_deref() {
+        Ok([z]) => Ok(Focus::Distance(*z)),
+        Ok([x, y]) => Ok(Focus::Pixel([*x, *y])),
+        _ => Err("expected a distance in scene units, or a pixel X,Y".into()),
+    }
 }
 
 fn second(text: &str) -> Result<f64, String> {

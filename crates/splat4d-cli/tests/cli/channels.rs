@@ -77,6 +77,47 @@ fn every_channel_is_an_image_and_numbers() {
 }
 
 #[test]
+fn films_for_compositing_have_shutter_lens_and_layers() {
+    let work = tempfile::tempdir().unwrap();
+    let [file, camera] = birds(work.path());
+    let at = |name: &str| work.path().join(name);
+    let render = |more: &[&str]| splat4d(&["render", str(&file)]).args(more).run();
+    let film = ["--size", "24x18", "--fps", "2", "--shutter", "180", "--aperture", "0.2", "--focus", "2.5"];
+    let pattern = at("comp/shot.%03d.exr");
+    render(&[&film[..], &["-o", str(&pattern)]].concat()).ok();
+    let bytes = std::fs::read(at("comp/shot.001.exr")).unwrap();
+    let has = |name: &[u8]| bytes.windows(name.len()).any(|w| w == name);
+    let names: [&[u8]; 5] = [b"A\0", b"Z\0", b"forward.u\0", b"label\0", b"1 bird"];
+    assert!(bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]) && names.iter().all(|name| has(name)));
+    // Frames of another film are not mixed with these.
+    let other = render(&["--size", "24x18", "--freeze", "0.5", "--seconds", "0.5", "--fps", "2", "-o", str(&pattern)]);
+    assert!(other.refused().contains("comp"));
+    render(&["--camera", str(&camera), "--shutter", "90", "--transparent", "-o", str(&at("clear.png"))]).ok();
+    assert!(image::open(at("clear.png")).unwrap().color().has_alpha());
+    render(&["--camera", str(&camera), "-o", str(&at("one.exr"))]).ok();
+    render(&["--camera", str(&camera), "--channel", "label", "-o", str(&at("label.exr"))]).ok();
+    let sphere = ["--projection", "equirectangular", "--size", "32x16", "--freeze", "0.5", "--path", "orbit"];
+    render(&[&sphere[..], &["--seconds", "0.1", "--fps", "10", "-o", str(&at("sphere"))]].concat()).ok();
+    let shown = image::open(at("sphere/00000.png")).unwrap().to_rgb8();
+    assert!((shown.width(), shown.height()) == (32, 16) && shown.pixels().any(|p| p.0 != shown.get_pixel(0, 0).0));
+    let eyes = ["--stereo", "over-under", "--eye-distance", "0.1", "--size", "24x18", "--freeze", "0.5"];
+    render(&[&eyes[..], &["--seconds", "0.1", "--fps", "10", "-o", str(&at("eyes"))]].concat()).ok();
+    assert_eq!(image::image_dimensions(at("eyes/00000.png")).unwrap(), (24, 36));
+
+    let out = ["-o", str(&at("x.png"))].map(str::to_owned);
+    let refused = |more: &[&str]| render(&[&out.each_ref().map(String::as_str)[..], more].concat()).refused();
+    for shutter in ["0", "720"] {
+        assert!(refused(&["--shutter", shutter]).contains("up to 360"), "{shutter}");
+    }
+    assert!(refused(&["--aperture", "0.1", "--focus", "-2"]).contains("in front of the camera"));
+    assert!(refused(&["--projection", "equirectangular", "--size", "30x16"]).contains("32x16"));
+    assert!(refused(&["--stereo", "side-by-side"]).contains("--eye-distance"));
+    assert!(refused(&["--transfer", "linear"]).contains(".exr"));
+    let camera = ["render", str(&file), "--camera", str(&camera), "--projection", "equirectangular", "-o"];
+    assert!(splat4d(&camera).args(&[str(&at("x.png"))]).run().refused().contains("40x30"));
+}
+
+#[test]
 fn a_label_is_exported_alone() {
     let work = tempfile::tempdir().unwrap();
     let [file, _] = birds(work.path());

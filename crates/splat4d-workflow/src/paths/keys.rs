@@ -187,7 +187,7 @@ fn read_key(value: &Value, scene_up: [f64; 3]) -> Result<Pose> {
 }
 
 /// The great arc from a to b (Shoemake 1985); straight where they almost agree.
-fn slerp(a: [f64; 4], b: [f64; 4], u: f64) -> [f64; 4] {
+pub(super) fn slerp(a: [f64; 4], b: [f64; 4], u: f64) -> [f64; 4] {
     let cos = (0..4).map(|k| a[k] * b[k]).sum::<f64>().clamp(-1.0, 1.0);
     let (wa, wb) = if cos > 1.0 - 1e-9 {
         (1.0 - u, u)

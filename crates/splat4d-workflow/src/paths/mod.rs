@@ -4,6 +4,8 @@ mod keys;
 mod orbit;
 
 use crate::camera_file::{MAX_PIXELS, MAX_SIDE};
+use splat4d::math::se3::mat_vec;
+use splat4d::math::{Se3, quat};
 use splat4d::scene::{Camera, Intrinsics};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -22,6 +24,29 @@ pub struct Shot {
     pub camera: Camera,
     /// When, seconds on the scene clock.
     pub time: f64,
+}
+
+impl Shot {
+    /// The shot a share of the way to another one: positions and numbers along lines, rotations along great arcs. Shares
+    /// below 0 and above 1 continue them.
+    pub fn towards(&self, other: &Self, share: f64) -> Self {
+        let mix = |a: f64, b: f64| a + (b - a) * share;
+        let (a, b) = (&self.camera, &other.camera);
+        let from = quat::from_rotation(&a.cam_from_world.rotation);
+        let mut to = quat::from_rotation(&b.cam_from_world.rotation);
+        // q and −q are one rotation; the nearer one gives the shorter way.
+        if (0..4).map(|k| from[k] * to[k]).sum::<f64>() < 0.0 {
+            to = to.map(|x| -x);
+        }
+        let rotation = quat::to_rotation(keys::slerp(from, to, share));
+        let (ca, cb) = (a.center(), b.center());
+        let translation = mat_vec(&rotation, std::array::from_fn(|k| mix(ca[k], cb[k]))).map(|x| -x);
+        let (i, j) = (&a.intrinsics, &b.intrinsics);
+        let intrinsics =
+            Intrinsics { fx: mix(i.fx, j.fx), fy: mix(i.fy, j.fy), cx: mix(i.cx, j.cx), cy: mix(i.cy, j.cy) };
+        let camera = Camera { cam_from_world: Se3 { rotation, translation }, intrinsics, ..a.clone() };
+        Self { camera, time: mix(self.time, other.time) }
+    }
 }
 
 /// A camera of the data set that the scene was trained on.
@@ -242,7 +267,6 @@ pub fn parse_size(text: &str) -> std::result::Result<[usize; 2], String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::math::Se3;
 
     fn view(name: &str, x: f64, time: f64, held: bool) -> View {
         let pose = Se3::look_at([x, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
