@@ -418,6 +418,23 @@ fn flags_in_documents_exist() {
     report(troubles, "Write the flag as `splat4d VERB --help` shows it.");
 }
 
+/// Columns of the command's help: clap breaks longer lines.
+const HELP_COLUMNS: usize = 100;
+
+#[test]
+fn examples_of_help_fit_their_line() {
+    let mut troubles = Vec::new();
+    for path in files("crates/splat4d-cli/src", "rs") {
+        for (at, line) in read(&path).lines().enumerate().filter(|(_, l)| l.starts_with("  splat4d ")) {
+            let columns = line.trim_end_matches("\";").chars().count();
+            if columns > HELP_COLUMNS {
+                troubles.push(format!("{path}:{}: {columns} columns, at most {HELP_COLUMNS}", at + 1));
+            }
+        }
+    }
+    report(troubles, "Shorten the explanation of the example.");
+}
+
 /// Where a motion model may be matched by its name or its spec: the list and the models' own files, and how each is
 /// learnt.
 const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];

@@ -117,7 +117,7 @@ impl Scene {
         let scene = &self.source.scene;
         let ([from, to], frame) = (scene.clip, OUTSIDE / scene.fps.max(f64::MIN_POSITIVE));
         if scene.is_moving() && t.is_finite() && !(from - frame..=to + frame).contains(&t) {
-            let message = format!("{t} s is outside of the scene's clip, {from} to {to} s: nothing was seen then");
+            let message = format!("{t} s is outside of the scene's clip, {from:.3} to {to:.3} s: no image shows it");
             crate::errors::warn(py, &[message])?;
         }
         time(t)
@@ -601,7 +601,7 @@ impl Scene {
     fn __repr__(&self) -> String {
         let [from, to] = self.source.scene.clip;
         let place = self.path.as_ref().map_or("in memory".into(), |path| format!("{path:?}"));
-        format!("Scene({place}, {} Gaussians, {from} to {to} s)", self.source.scene.len())
+        format!("Scene({place}, {} Gaussians, {from:.3} to {to:.3} s)", self.source.scene.len())
     }
 }
 

@@ -331,6 +331,7 @@ class BlenderCapture(InFolder):
         self.assertEqual(about.returncode, 0, about.stderr)
         self.assertIn("looks healthy", about.stdout)
         self.assertNotIn("!", about.stdout)
+        self.assertNotIn("not read", about.stdout)
         self.assertNotIn("warning", about.stdout + about.stderr)
         done = subprocess.run([COMMAND, "train", out, "-o", run, "--device", "cpu", "--set", "iterations=200", "--set", "loss.flow=0.1",
                                "--set", "loss.tracks=0.1"], capture_output=True, text=True)

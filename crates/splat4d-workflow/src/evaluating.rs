@@ -549,7 +549,7 @@ pub fn write_page(run: &Path, console: &dyn Listener) -> Result<()> {
 }
 
 /// Scores in one line.
-fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
+pub(crate) fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
     let mut words = Vec::new();
     for (key, name, digits, unit) in [
         ("PSNR", "PSNR", 2, " dB"),

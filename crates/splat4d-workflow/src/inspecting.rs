@@ -8,6 +8,7 @@ pub use playback::{Conformance, conformance};
 
 use crate::activity::Activity;
 use crate::chunked;
+use crate::evaluating;
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Origin, Run, check_written};
@@ -421,8 +422,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
         troubles.push(format!("Training rolled back {n} times because a value was not finite: check the poses."));
     }
     if let Some(results) = run.results.as_ref().and_then(Value::as_object) {
-        let scores: Vec<String> = results.iter().filter_map(|(k, v)| Some(format!("{k} {:.4}", v.as_f64()?))).collect();
-        line(&mut text, "held-out scores", &scores.join(", "));
+        line(&mut text, "held-out scores", &evaluating::in_words(|key| results.get(key)?.as_f64()));
     } else {
         line(&mut text, "held-out scores", "not measured yet: splat4d eval RUN");
     }

@@ -20,7 +20,7 @@ Examples:
   splat4d compress runs/knight --level 1           only quantised and fine-tuned
   splat4d compress runs/knight --set rounds=3 --set temporal=width
   splat4d compress --resume runs/knight-compressed    continue exactly
-  splat4d compress output/room --capture room -o small    a scene that another program trained on this capture
+  splat4d compress output/room --capture room -o small    another program's scene of this capture
 
 The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after. The original run is \
 unchanged. docs/compression.md explains the settings.";

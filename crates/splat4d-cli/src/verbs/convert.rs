@@ -12,14 +12,14 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d convert scene.ply scene.spz                 .spz, version 3; --spz-version 4 for the newest
+  splat4d convert scene.ply scene.spz                 .spz, version 3; --spz-version 4: the newest
   splat4d convert scene.sog scene.ply --up y          y up instead of the format's y down
   splat4d convert scene.ply small.compressed.ply --sh 1
   splat4d convert runs/knight knight.splatv           dynamic: splaTV and gsplat.js play it
   splat4d convert runs/knight now.spz --time 0.5      one time
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
-  splat4d convert runs/knight 'frames/f_%04d.ply' --frames --constant     for interpolation and motion blur
-  splat4d convert runs/knight 'take/' --frames --for unreal               z up, centimetres, left-handed
+  splat4d convert runs/knight 'frames/f_%04d.ply' --frames --constant     for motion blur
+  splat4d convert runs/knight 'take/' --frames --for unreal               z up, cm, left-handed
   splat4d convert runs/knight knight.usdz             USD with time samples
   splat4d convert frames/ all.safetensors --fps 25    numbered files become one dynamic scene
   splat4d convert runs/field field.ply --world        positions in the capture's map

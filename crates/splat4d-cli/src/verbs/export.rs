@@ -14,15 +14,15 @@ use std::path::{Path, PathBuf};
 const EXAMPLES: &str = "\
 Examples:
   splat4d export runs/knight -o now.ply --time 0.5         one time; every 3DGS viewer opens it
-  splat4d export runs/knight --sequence frames/            frame_00000.ply ...; SuperSplat plays them
+  splat4d export runs/knight --sequence frames/            frame_00000.ply ...; for SuperSplat
   splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
-  splat4d export runs/knight --sequence frames/ --for unreal            z up, centimetres, left-handed
+  splat4d export runs/knight --sequence frames/ --for unreal            z up, cm, left-handed
   splat4d export runs/knight --html -o knight.html         player and scene in one page
   splat4d export runs/knight --html -o index.html --link knight.s4d    for a web server
   splat4d export runs/knight --tracks tracks.csv           positions at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
   splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
-  splat4d export runs/knight --tracks paths.csv --points asked.csv    given points, and their visibility
+  splat4d export runs/knight --tracks paths.csv --points asked.csv    given points
   splat4d export runs/knight -o knight.ply --time 0.5 --label knight
 
 A file of points has a header and one line per point, either a camera's pixel at a time or a position at a time:

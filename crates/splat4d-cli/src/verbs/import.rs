@@ -22,8 +22,8 @@ Examples:
   splat4d import walk.mp4 -o walk --every 5          one moving camera, a static scene
   splat4d import videos/ -o my-take --apart left,right=2.4    lengths in metres
   splat4d import videos/ -o my-take --board 36h11:0.16:floor    an AprilTag of 16 cm on the floor
-  splat4d import videos/ -o my-take --calibration Calib.toml    known poses; offsets and points are found
-  splat4d import videos/ -o my-take --assist    cameras at right angles: click points in a local page
+  splat4d import videos/ -o my-take --calibration Calib.toml    known poses; offsets are found
+  splat4d import videos/ -o my-take --assist    cameras at right angles: click points in a page
 
 my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
 the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";

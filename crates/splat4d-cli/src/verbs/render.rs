@@ -11,13 +11,13 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d render runs/knight                               an orbit, into runs/knight/renders/orbit.mp4
+  splat4d render runs/knight                               an orbit, into renders/orbit.mp4
   splat4d render runs/knight -o frozen.mp4 --freeze 0.4    bullet time: time stops at 0.4 s
   splat4d render runs/knight --path camera=cam03 --slow-motion 4 -o slow.mp4
   splat4d render runs/knight --path keys.json --size 1280x720 -o flight.mp4
   splat4d render runs/knight --path test -o views/         held-out views as numbered PNGs
   splat4d render runs/knight --channel depth --from 0.2 --to 0.8 -o depth.mp4
-  splat4d render runs/knight --channel flow --path camera=cam03 -o flow/ --raw flow/ --raw-format flo
+  splat4d render runs/knight --channel flow --path camera=cam03 -o uv/ --raw uv/ --raw-format flo
   splat4d render runs/knight --channel uncertainty -o unsure.mp4
   splat4d render scene.ply --camera cam.json -o view.png --raw view
   splat4d render runs/knight --shutter 180 --aperture 0.1 -o blurred.mp4

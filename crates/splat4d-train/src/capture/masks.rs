@@ -109,7 +109,8 @@ fn report_others(take: &mut RawCapture, folders: &[String]) {
     let read = |folder: &String| {
         let folder = take.root.join(folder);
         let maps = |f: &RawFrame| {
-            [f.depth.as_ref().map(|d| d.path.clone()), f.mask.clone(), f.labels.clone(), f.features.clone()]
+            let (depth, flow) = (f.depth.as_ref().map(|d| d.path.clone()), f.flow.as_ref().map(|d| d.path.clone()));
+            [depth, flow, f.mask.clone(), f.labels.clone(), f.features.clone()]
         };
         take.frames
             .iter()

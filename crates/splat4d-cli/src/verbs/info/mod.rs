@@ -15,7 +15,7 @@ Examples:
   splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
   splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage
-  splat4d info scene.s4d --strict every deviation from the format's specification, for writers of the format";
+  splat4d info scene.s4d --strict every deviation from the format's specification";
 
 /// Print what a capture, run or file contains, and whether it looks healthy
 #[derive(Debug, clap::Args)]
