@@ -109,7 +109,7 @@ fn report_others(take: &mut RawCapture, folders: &[String]) {
     let read = |folder: &String| {
         let folder = take.root.join(folder);
         let maps = |f: &RawFrame| {
-            let (depth, flow) = (f.depth.as_ref().map(|d| d.path.clone()), f.flow.as_ref().map(|d| d.path.clone()));
+            let (depth, flow) = (f.depth.as_ref().map(|d| d.path.clone()), f.flow.clone());
             [depth, flow, f.mask.clone(), f.labels.clone(), f.features.clone()]
         };
         take.frames
