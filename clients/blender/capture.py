@@ -16,6 +16,7 @@ import math
 import os
 import pathlib
 import re
+import signal
 import struct
 import sys
 import zlib
@@ -44,6 +45,8 @@ HIDDEN = 1e-3
 SAMPLED_FRAMES = 12
 # Cameras from which an initial point takes its colour.
 COLOUR_CAMERAS = 8
+# Ctrl-C, which Blender would lose during a render: it is obeyed after the render.
+STOPS = []
 SURFACES = {"MESH", "CURVE", "SURFACE", "FONT", "META"}
 
 
@@ -804,6 +807,8 @@ def capture(args, say, settings, temporary):
 
     for i, frame in enumerate(frames):
         for camera in cameras:
+            if STOPS:
+                raise KeyboardInterrupt
             place = f"{camera.name}/{i:04d}"
             files = {"image": f"images/{place}.png"}
             if not args.no_depth:
@@ -905,6 +910,10 @@ def main(argv):
         if last or terminal:
             os.write(own, (text + end).encode())
 
+    STOPS.clear()
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: STOPS.append(True))
     try:
         checked(args)
         capture(args, say, settings, temporary)
@@ -916,6 +925,8 @@ def main(argv):
         print("stopped. The same command continues.", file=sys.stderr)
         return 130
     finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
         settings.restore()
         for where, thing in temporary:
             try:

@@ -207,6 +207,19 @@ class BlenderCapture(InFolder):
         error = capture(killed, *options, "--opaque", code=2)
         self.assertIn("opaque was False, now True", error)
 
+    def test_ctrl_c_stops_after_the_render(self):
+        out = self.folder / "out"
+        child = subprocess.Popen([sys.executable, SCRIPT, out, "--demo", "table", *SMALL, "--frames", "1", "40"], stdout=subprocess.DEVNULL,
+                                 stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+        deadline = time.monotonic() + 60
+        while not (out / "images/cam01/0000.png").exists() and time.monotonic() < deadline and child.poll() is None:
+            time.sleep(0.005)
+        child.send_signal(signal.SIGINT)
+        _, error = child.communicate(timeout=60)
+        self.assertEqual(child.returncode, 130, error)
+        self.assertIn("The same command continues", error)
+        self.assertEqual(list(out.rglob("*.part")), [])
+
     def test_masks_and_labels_name_objects(self):
         out = self.folder / "out"
         capture(out, "--demo", "table", *SMALL, "--frames", 1, 2, "--count", 3, "--labels", "--subject", "cube,ball")
