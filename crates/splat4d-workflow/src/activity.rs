@@ -18,7 +18,7 @@ pub struct Activity {
     pub inactive: Vec<f64>,
     /// [seconds between two frames, mean intersection over union of their active sets].
     pub overlap: Vec<[f64; 2]>,
-    /// [at most so many seconds, share of the Gaussians], by length of the time in which they are active.
+    /// [longest, seconds; share of the Gaussians], by length of the time in which they are active.
     pub lasting: Vec<[f64; 2]>,
 }
 

@@ -1,5 +1,5 @@
 //! The estimate of the time that the remaining steps of a run take. Steps at half size are a fraction of those that
-//! follow, and Gaussians grow, so that the mean of the steps so far would promise far too little.
+//! follow, and Gaussians grow, so that the mean of the past steps would promise too little.
 
 use super::budget::Place;
 
