@@ -388,7 +388,9 @@ impl Work {
             }
             self.drop_removed()?;
         };
-        self.draw_removed(&original)?;
+        if after.is_some() {
+            self.draw_removed(&original)?;
+        }
         self.drop_removed()?;
         if let (Some(before), Some(after)) = (before, after) {
             let compared = self.compare(&source, &original, [&before, &after], stop, recorded)?;
@@ -464,10 +466,13 @@ impl Work {
         })
     }
 
-    /// Scenes of what the rounds of pruning removed.
+    /// Scenes of what the rounds of pruning removed, in their order; a round without steps may have none.
     fn removed(&self) -> Vec<PathBuf> {
-        let file = |round: usize| self.dir.join(format!("removed-{round}.safetensors"));
-        (1..).map(file).take_while(|f| f.is_file()).collect()
+        let named = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("removed-"));
+        let mut files: Vec<PathBuf> =
+            std::fs::read_dir(&self.dir).into_iter().flatten().flatten().map(|e| e.path()).filter(named).collect();
+        files.sort();
+        files
     }
 
     /// Deletes them: they are as large as the original, and only a compression that was stopped needs them.
@@ -487,6 +492,7 @@ impl Work {
             return Ok(());
         }
         let held: Vec<&Frame> = original.capture.held.iter().map(|&i| &original.capture.frames[i]).collect();
+        files::make_folder(&self.dir.join(REMOVED))?;
         let mut painter = Painter::new(&all, [0.0; 3], original.recipe.appearance.antialias, false);
         for i in pictures::spread(held.len(), VIEWS) {
             let image = painter.picture(&held[i].view, held[i].time.0, Channel::Color, [0.0, 1.0]);
