@@ -37,8 +37,8 @@
 //! | `device.rs`, `draw.rs`, `draw/`, `video.rs`, `raw_values.rs`, `rendering.rs`, `rendering/` | renders a scene's channels as images, films, arrays; shutter, lens, spheres, layers for compositing |
 //! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
 //! | `point_queries.rs` | points followed through a scene |
-//! | `activity.rs` | which Gaussians of a scene are active when |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
+//! | `activity.rs` | which Gaussians of a scene are active when |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |

@@ -44,11 +44,10 @@ fn a_run_is_compressed_and_measured_before_and_after() {
     // It is a run like any other; the original is as it was.
     let page = std::fs::read_to_string(dir.join("report.html")).unwrap();
     assert!(page.contains("Compressed") && page.contains("not pruned, same steps"), "the report compares");
-    assert!(page.contains("removed Gaussians alone") && page.contains("Inactive Gaussians by frame"));
+    assert!(page.contains("removed Gaussians alone"));
     let removed = image::open(dir.join("removed/00000.png")).unwrap().to_rgb8();
     assert!(removed.pixels().any(|p| p.0 != [0; 3]), "what was removed is drawn");
     assert!(!dir.join("removed-1.safetensors").exists() && !dir.join("removed-4.safetensors").exists());
-    assert!(told["activity"][0].is_object() || told["activity"][1].is_object(), "{}", told["activity"]);
     splat4d(&["info", str(&dir)]).run().ok();
     splat4d(&["eval", str(&dir)]).run().ok();
     assert_eq!(std::fs::read(dir.join("scene.s4d")).unwrap(), file, "measuring does not bake anew");

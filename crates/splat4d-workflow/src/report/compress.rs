@@ -342,7 +342,7 @@ fn both_pictures(out: &mut String, run: &Run, compressed: &Compressed) {
         let Some(difference) = pictures::difference(&a, &b) else { continue };
         let removed = pictures::inline(&run.path.join(REMOVED).join(file));
         let all = [pictures::inline(&a), pictures::inline(&b), Some(difference), removed];
-        shown.push_str("<div class=\"view\">");
+        shown.push_str(if all[3].is_some() { "<div class=\"view four\">" } else { "<div class=\"view\">" });
         for (picture, caption) in all.iter().zip(["before", "compressed", "difference", "removed Gaussians alone"]) {
             let Some(picture) = picture else { continue };
             let _ = write!(
