@@ -211,7 +211,7 @@ impl Photo {
                 "Render it without them, or write colour as .exr: its depth, motion and labels are sharp.",
             );
         }
-        if self.transparent && !(color && output.is_none_or(|o| writes_png(o))) {
+        if self.transparent && !(color && output.is_none_or(writes_png)) {
             return refuse(
                 "only colour in .png files has transparency",
                 "Use option `output` NAME.png, NAME.%04d.png or a folder; .exr always has alpha.",
