@@ -30,6 +30,10 @@ impl Activity {
         if times.len() < 2 || total == 0 {
             return None;
         }
+        let mut ids = Vec::new();
+        if scene.layers.iter().all(|layer| times.iter().all(|t| layer.active(Time(*t), &mut ids))) {
+            return None;
+        }
         let sets: Vec<Set> = times.iter().map(|t| Set::at(scene, *t)).collect();
         if sets.iter().all(|s| s.count == total) {
             return None;
