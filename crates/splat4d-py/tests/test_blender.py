@@ -16,7 +16,7 @@ import unittest
 import zlib
 
 import numpy as np
-from common import ROOT, InFolder
+from common import ROOT, InFolder, module
 
 SCRIPT = ROOT / "clients/blender/capture.py"
 SMALL = ["--size", "64", "48", "--samples", "4"]
@@ -25,14 +25,6 @@ COMMAND = os.environ.get("SPLAT4D") or shutil.which("splat4d")
 AROUND = 0.02
 MOST_DEPTH_ERROR = 1e-3
 MOST_FLOW_ERROR = 0.1
-
-
-def module(path, name):
-    spec = importlib.util.spec_from_file_location(name, path)
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[name] = made
-    spec.loader.exec_module(made)
-    return made
 
 
 def capture(*args, code=0):

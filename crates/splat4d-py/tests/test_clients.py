@@ -13,7 +13,7 @@ import unittest
 import zipfile
 
 import numpy as np
-from common import PLAYABLE, ROOT, InFolder
+from common import PLAYABLE, ROOT, InFolder, module
 
 CLIENTS = ROOT / "clients"
 SET = CLIENTS / "conformance"
@@ -23,14 +23,6 @@ MOST_LINES = 600
 MUTANTS = 20_000
 SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 WARN = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
-
-
-def module(path, name):
-    spec = importlib.util.spec_from_file_location(name, path)
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[name] = made
-    spec.loader.exec_module(made)
-    return made
 
 
 s4d = module(CLIENTS / "python/s4d.py", "s4d")

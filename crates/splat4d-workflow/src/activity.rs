@@ -1,12 +1,10 @@
-//! Which Gaussians a scene shows when: how many rest at a time, how long they last, and how much the sets of two frames
-//! have in common, which is the argument for active sets (4DGS-1K, Yuan et al. 2025, figure 2).
+//! Which Gaussians a scene shows when: how many rest at a time, and how much the sets of two frames have in common, which
+//! is the argument for active sets (4DGS-1K, Yuan et al. 2025).
 
+use crate::measure::frames;
 use serde::{Deserialize, Serialize};
 use splat4d::layers::Scene;
 use splat4d::scene::Time;
-
-/// Frames that are examined; those of longer clips are thinned evenly.
-const FRAMES: usize = 240;
 
 /// A scene's Gaussians over time. A Gaussian is active where its opacity times its life is visible and masks admit it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -18,36 +16,29 @@ pub struct Activity {
     pub inactive: Vec<f64>,
     /// [seconds between two frames, mean intersection over union of their active sets].
     pub overlap: Vec<[f64; 2]>,
-    /// [longest, seconds; share of the Gaussians], by length of the time in which they are active.
-    pub lasting: Vec<[f64; 2]>,
 }
 
 impl Activity {
     /// Examines a scene; `None` where nothing changes: one frame, or all Gaussians active at all times.
     pub fn of(scene: &Scene<f32>) -> Option<Self> {
-        let times = frames(scene);
+        let times = frames(scene.clip, scene.fps);
         let total = scene.len();
         if times.len() < 2 || total == 0 {
             return None;
         }
         let mut ids = Vec::new();
-        if scene.layers.iter().all(|layer| times.iter().all(|t| layer.active(Time(*t), &mut ids))) {
+        if scene.layers.iter().all(|layer| times.iter().all(|t| layer.active(*t, &mut ids))) {
             return None;
         }
         let sets: Vec<Set> = times.iter().map(|t| Set::at(scene, *t)).collect();
         if sets.iter().all(|s| s.count == total) {
             return None;
         }
-        let mut frames_of = vec![0u32; total];
-        for set in &sets {
-            set.rows(|row| frames_of[row] += 1);
-        }
-        let step = (times[times.len() - 1] - times[0]) / (times.len() - 1) as f64;
+        let step = (times[times.len() - 1].0 - times[0].0) / (times.len() - 1) as f64;
         Some(Self {
             inactive: sets.iter().map(|s| 1.0 - s.count as f64 / total as f64).collect(),
             overlap: distances(times.len()).map(|d| [d as f64 * step, mean_overlap(&sets, d)]).collect(),
-            lasting: lasting(&frames_of, times.len(), step),
-            times,
+            times: times.into_iter().map(|t| t.0).collect(),
         })
     }
 
@@ -75,12 +66,12 @@ struct Set {
 }
 
 impl Set {
-    fn at(scene: &Scene<f32>, time: f64) -> Self {
+    fn at(scene: &Scene<f32>, time: Time) -> Self {
         let mut bits = vec![0u64; scene.len().div_ceil(64)];
         let (mut first, mut count, mut ids) = (0, 0, Vec::new());
         for layer in &scene.layers {
             let rows = layer.params.len();
-            if layer.active(Time(time), &mut ids) {
+            if layer.active(time, &mut ids) {
                 ids.extend(0..rows as u32);
             }
             count += ids.len();
@@ -92,32 +83,12 @@ impl Set {
         Self { bits, count }
     }
 
-    fn rows(&self, mut each: impl FnMut(usize)) {
-        for (word, bits) in self.bits.iter().enumerate() {
-            let mut rest = *bits;
-            while rest != 0 {
-                each(64 * word + rest.trailing_zeros() as usize);
-                rest &= rest - 1;
-            }
-        }
-    }
-
     /// Intersection over union; two empty sets are equal.
     fn overlap(&self, other: &Self) -> f64 {
         let both: u32 = self.bits.iter().zip(&other.bits).map(|(a, b)| (a & b).count_ones()).sum();
         let any = self.count + other.count - both as usize;
         if any == 0 { 1.0 } else { f64::from(both) / any as f64 }
     }
-}
-
-/// Seconds of the clip's frames.
-fn frames(scene: &Scene<f32>) -> Vec<f64> {
-    let [from, to] = scene.clip;
-    if to.partial_cmp(&from) != Some(std::cmp::Ordering::Greater) || !scene.fps.is_finite() || scene.fps <= 0.0 {
-        return vec![from];
-    }
-    let last = ((to - from) * scene.fps).round().clamp(1.0, (FRAMES - 1) as f64) as usize;
-    (0..=last).map(|i| from + (to - from) * i as f64 / last as f64).collect()
 }
 
 /// Distances of frames: doubled from one to the whole clip.
@@ -132,19 +103,6 @@ fn mean_overlap(sets: &[Set], distance: usize) -> f64 {
     (0..pairs).map(|i| sets[i].overlap(&sets[i + distance])).sum::<f64>() / pairs as f64
 }
 
-/// Shares by length, in the steps of [`distances`]; those that are never active belong to the first.
-fn lasting(frames_of: &[u32], frames: usize, step: f64) -> Vec<[f64; 2]> {
-    let mut from = 0;
-    distances(frames + 1)
-        .map(|to| {
-            let inside = |n: &&u32| (**n as usize) <= to && (from == 0 || **n as usize > from);
-            let count = frames_of.iter().filter(inside).count();
-            from = to;
-            [to as f64 * step, count as f64 / frames_of.len() as f64]
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -155,14 +113,10 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn shares_are_those_of_the_lifespans() {
+    fn distances_double_up_to_the_whole_clip() {
         assert_eq!(distances(2).collect::<Vec<_>>(), [1]);
         assert_eq!(distances(9).collect::<Vec<_>>(), [1, 2, 4, 8]);
         assert_eq!(distances(8).collect::<Vec<_>>(), [1, 2, 4, 7]);
-        let lengths = lasting(&[0, 1, 2, 3, 9, 9], 9, 0.1);
-        let shares: Vec<f64> = lengths.iter().map(|l| (6.0 * l[1]).round()).collect();
-        assert_eq!((lengths.len(), shares), (5, vec![2.0, 1.0, 1.0, 0.0, 2.0]));
-        assert!((lengths[4][0] - 0.9).abs() < 1e-12);
     }
 
     #[test]
@@ -181,7 +135,6 @@ mod tests {
         assert_eq!(found.inactive, vec![0.5; 10]);
         assert_eq!(found.overlap.first().unwrap()[1], 8.0 / 9.0, "one pair of nine differs");
         assert_eq!(found.overlap.last().unwrap()[1], 0.0);
-        assert_eq!(found.lasting.iter().find(|l| l[1] > 0.0).unwrap()[1], 1.0);
         assert!((found.mean_inactive() - 0.5).abs() < 1e-12);
         assert_eq!(
             found.sentence(),

@@ -461,8 +461,7 @@ impl Work {
             }),
             tried: order.tried.clone(),
             warnings: recorded.warnings(),
-            activity: [Some(original.scene.clone()), read_scene(&self.dir.join("scene.safetensors")).ok()]
-                .map(|scene| scene.and_then(|s| Activity::of(&s))),
+            activity: [Activity::of(original.scene), Activity::of(&read_scene(&self.dir.join("scene.safetensors"))?)],
         })
     }
 

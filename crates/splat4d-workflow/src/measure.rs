@@ -267,7 +267,7 @@ fn weighed(scene: &Scene<f32>, bytes: usize) -> Side {
 }
 
 /// The times of the clip's frames, thinned evenly where they are many.
-fn frames(clip: [f64; 2], fps: f64) -> Vec<Time> {
+pub(crate) fn frames(clip: [f64; 2], fps: f64) -> Vec<Time> {
     let fps = if fps.is_finite() && fps > 0.0 { fps } else { DEFAULT_FPS };
     let last = ((clip[1] - clip[0]) * fps).round().max(0.0);
     let count = last.min((COUNTED - 1) as f64) as usize + 1;

@@ -294,7 +294,7 @@ fn tried(tried: &[Tried]) -> Option<String> {
     Some(format!("{curve}<p class=\"note\">{}</p>", escape(&trials.join(" · "))))
 }
 
-/// What active sets save: what rests in each frame, what frames have in common, and how long Gaussians last.
+/// What active sets save: what rests in each frame, and what frames have in common.
 fn activity(out: &mut String, compressed: &Compressed) {
     let curves = |points: &dyn Fn(&Activity) -> Vec<(f64, f64)>, x: &str| {
         let sides = ["before", "compressed"].into_iter().zip(&compressed.activity);
@@ -315,18 +315,8 @@ fn activity(out: &mut String, compressed: &Compressed) {
                 "What active sets of two frames share, % (intersection over union), by the time between them",
                 curves(&|a| a.overlap.iter().map(|[d, share]| (*d, percent(*share))).collect(), "s"),
             ),
-            ("Time for which Gaussians are active, compressed", lasting(compressed.activity[1].as_ref())),
         ],
     );
-}
-
-fn lasting(activity: Option<&Activity>) -> Option<String> {
-    let rows: Vec<(String, f64, String)> = activity?
-        .lasting
-        .iter()
-        .map(|[seconds, share]| (format!("up to {} s", short(*seconds)), *share, format!("{:.1} %", 100.0 * share)))
-        .collect();
-    bars(&rows, 0.0, "shares of the Gaussians")
 }
 
 /// Held-out views as the source shows them, as the file does, and where they differ.
