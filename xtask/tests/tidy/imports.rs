@@ -145,6 +145,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "training",
             "importing",
             "inspecting",
+            "storage",
             "predicting",
             "editing",
             "picking",
@@ -154,7 +155,10 @@ const ORDER: [(&str, &[&str]); 9] = [
             "texts",
         ],
     ),
-    ("crates/splat4d-cli", &["interrupt", "bar", "console", "device", "measuring", "serving", "verbs", "main", "bin"]),
+    (
+        "crates/splat4d-cli",
+        &["interrupt", "bar", "console", "device", "measuring", "serving", "storage", "verbs", "main", "bin"],
+    ),
     (
         "crates/splat4d-py",
         &[
