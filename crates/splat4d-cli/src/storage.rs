@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 
 /// The place of local copies.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Object storage")]
 pub(crate) struct StorageArgs {
     /// Folder for local copies of s3://BUCKET/FOLDER addresses [default: splat4d in the user's cache folder]
     #[arg(long, value_name = "FOLDER")]

@@ -176,7 +176,8 @@ export class Camera {
     if (!this.first || !this.seen) return this.lift;
     const half = height / 2 / f, [top, bottom] = this.seen;
     const first = top + half > bottom - half ? (top + bottom) / 2 : clamp(0, top + half, bottom - half);
-    return lerp(this.lift, first, this.first);
+    // The subject stays in the middle half.
+    return lerp(this.lift, clamp(first, -half / 2, half / 2), this.first);
   }
 
   /** How much larger a first view is where the window is taller than wide, each measured in what was seen. */
