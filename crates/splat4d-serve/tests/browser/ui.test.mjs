@@ -437,7 +437,7 @@ test('the first view of a tall window shows as little as possible of what no cam
   first.loosen(width, height);
   near(first.view(width, height).cy, view.cy, 1e-6);
   near(first.view(844, 390).cy, 195);
-  // A camera that looks elsewhere says nothing about this view.
+  // A camera that looks elsewhere gives no information about this view.
   const away = firstCamera({ ...meta, view: { position: [0, 1.6, 5.8], target: [0, 1.6, 20] } }).view(width, height);
   assert.ok(away.cy >= height / 4 && away.cy <= 3 * height / 4, `${away.cy}`);
   near(first.set({ position: [0, 0, 4] }).view(width, height).cy, height / 2);

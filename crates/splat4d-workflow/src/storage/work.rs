@@ -87,14 +87,16 @@ pub fn train(
 /// The capture of a training.
 enum Source {
     Local(PathBuf),
-    Remote { store: Box<dyn Store>, address: Address, place: Place },
+    Remote { store: Box<dyn Store>, address: Address, place: Box<Place> },
 }
 
 impl Source {
     fn of(capture: &Path, storage: &Storage) -> Result<Self> {
         Ok(match Address::of(capture)? {
             None => Self::Local(capture.to_owned()),
-            Some(address) => Self::Remote { store: storage.store(&address)?, place: storage.place(&address)?, address },
+            Some(address) => {
+                Self::Remote { store: storage.store(&address)?, place: Box::new(storage.place(&address)?), address }
+            }
         })
     }
 
