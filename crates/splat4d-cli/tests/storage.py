@@ -4,6 +4,7 @@ SPLAT4D: the command, built with the feature `storage`. Needs moto[s3,server].
 """
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -14,6 +15,9 @@ from pathlib import Path
 
 import boto3
 from moto.server import ThreadedMotoServer
+
+# A line per request.
+logging.getLogger("werkzeug").setLevel(logging.ERROR)
 
 KNIGHT = Path(__file__).resolve().parents[3] / "examples/knight"
 COMMAND = os.environ["SPLAT4D"]
@@ -125,7 +129,7 @@ class Storage(unittest.TestCase):
         self.assertIn(self.address("day/capture"), self.object("run.json").decode())
 
     def test_a_killed_worker_is_replaced(self):
-        steps = 400
+        steps = 60
         expected = self.shared_folder(steps)
         first = self.begin(*self.train("shared", steps), worker="first")
         deadline = time.monotonic() + 120
