@@ -131,6 +131,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "programs",
             "converting",
             "exporting",
+            "meshing",
             "localising",
             "comparing",
             "report",
