@@ -383,10 +383,11 @@ impl Scene {
             }
             (Some("html"), None) => exporting::page(file, &path, None, listener),
             (Some("ply"), _) => {
-                let source = Source::open(file)?;
+                let mut source = Source::open(file)?;
                 source.keep(file, &path, &[])?;
+                not_empty(&source.scene, file)?;
+                exporting::fold(&mut source, listener)?;
                 let scene = &source.scene;
-                not_empty(scene, file)?;
                 let t = t.unwrap_or(scene.clip[0]);
                 let count = exporting::moment(scene, t, false, &path)?;
                 exporting::warn_of_empty(scene, t, count, listener);
@@ -417,7 +418,8 @@ impl Scene {
         let mut count = 0;
         let work = |file: &Path, _: &Path| {
             listening(|listener| {
-                let source = exporting::open(file, None)?;
+                let mut source = exporting::open(file, None)?;
+                exporting::fold(&mut source, listener)?;
                 count = exporting::frames(file, &source, &folder, &frames, [world, force], listener)?;
                 Ok(())
             })

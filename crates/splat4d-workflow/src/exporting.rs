@@ -1,8 +1,10 @@
 //! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and
 //! paths of its Gaussians, or of requested points, as JSON or CSV.
 
+use crate::deadline::Deadline;
 use crate::events::Listener;
 use crate::files;
+use crate::folding;
 use crate::playable::Playable;
 use crate::point_queries::{self, QueryResult};
 use crate::run_folder::Run;
@@ -68,6 +70,11 @@ pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
     }
     not_empty(&source.scene, path)?;
     Ok(source)
+}
+
+/// Folds a network that makes colours into spherical harmonics, for files of Gaussians. Errors: its cameras are unknown.
+pub fn fold(source: &mut Source, listener: &dyn Listener) -> Result<()> {
+    folding::fold(source, "a .ply file", &Deadline::default(), listener)
 }
 
 /// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence

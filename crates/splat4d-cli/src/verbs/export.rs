@@ -143,9 +143,12 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.link.is_some() {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
-    let source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
+    let mut source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
     let outputs: Vec<&Path> = args.output.iter().chain(&args.tracks).map(PathBuf::as_path).collect();
     source.keep_all(path, &outputs, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
+    if args.tracks.is_none() && args.program.is_none() {
+        exporting::fold(&mut source, console)?;
+    }
     let scene = &source.scene;
     let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {

@@ -493,7 +493,10 @@ impl<F: Real> Scene<F> {
                 ErrorKind::Unsupported,
                 format!("{what} cannot hold this scene: a network makes its colours, pixel by pixel (features = full)"),
             )
-            .remedy("Train with --set features=none for that; `render` and `eval` render the scene with it")),
+            .remedy(
+                "Give the folder of its run: `bake`, `export` and `convert` fold the network into spherical harmonics as its cameras \
+                 see them. Or train with --set features=none",
+            )),
         }
     }
 }
