@@ -21,7 +21,7 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::draw::{Channel, Painter, Transfer, antialias};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::localising::{LocaliseOptions, localise};
 use splat4d_workflow::paths::{Route, View};
 use splat4d_workflow::rendering::{self as films, Focus, Photo, Projection, RenderOptions, Stereo};
@@ -389,7 +389,7 @@ impl Scene {
                 exporting::fold(&mut source, listener)?;
                 let scene = &source.scene;
                 let t = t.unwrap_or(scene.clip[0]);
-                let count = exporting::moment(scene, t, false, &path)?;
+                let count = exporting::moment(scene, t, PlyOptions::default(), &path)?;
                 exporting::warn_of_empty(scene, t, count, listener);
                 Ok(())
             }
@@ -420,7 +420,14 @@ impl Scene {
             listening(|listener| {
                 let mut source = exporting::open(file, None)?;
                 exporting::fold(&mut source, listener)?;
-                count = exporting::frames(file, &source, &folder, &frames, [world, force], listener)?;
+                count = exporting::frames(
+                    file,
+                    &source,
+                    &folder,
+                    &frames,
+                    (PlyOptions { world, velocities: false }, force),
+                    listener,
+                )?;
                 Ok(())
             })
         };

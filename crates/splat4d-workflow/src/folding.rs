@@ -49,7 +49,8 @@ pub fn fold(source: &mut Source, what: &str, deadline: &Deadline, console: &dyn 
     let folded = fold_head(&source.scene, &shots, DEGREE, mode, progress)?;
     let other = if held.is_empty() { ("training", &seen) } else { ("held-out", &held) };
     let mut cpu = device::cpu(RenderConfig { antialias: mode, ..RenderConfig::default() });
-    let alike = compare(&source.scene, Shown::File(&folded), &chosen(other.1, COMPARED), cpu.as_mut(), &mut |_, _| true)?;
+    let alike =
+        compare(&source.scene, Shown::File(&folded), &chosen(other.1, COMPARED), cpu.as_mut(), &mut |_, _| true)?;
     console.clear();
     if let Some(l) = alike {
         console.result(&format!(

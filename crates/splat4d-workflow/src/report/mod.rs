@@ -167,7 +167,9 @@ fn cards(out: &mut String, run: &Run) {
         card("", value.into(), unit, &format!("playback file scene.s4d{like}"));
     }
     out.push_str("</div>\n");
-    if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex", "LPIPS-squeeze"].iter().any(|k| run.score(k).is_some()) {
+    if run.results.is_some()
+        && !["LPIPS", "LPIPS-vgg", "LPIPS-alex", "LPIPS-squeeze"].iter().any(|k| run.score(k).is_some())
+    {
         out.push_str("<p class=\"note\">LPIPS was not computed: give its weights with --lpips-weights.</p>\n");
     }
 }

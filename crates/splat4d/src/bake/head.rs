@@ -231,7 +231,14 @@ mod tests {
         let keys = HeadKeys::of(&params).unwrap();
         (0..18).for_each(|i| params[keys.second].set(i, 0, 0.8 * Rng::new(4, "out", 0).normal(i as u64) as f32));
         let layer = Layer::new("a", params, motion, LifeKind::GaussHalf);
-        Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], head: Head::Features, ..Scene::default() }
+        Scene {
+            layers: vec![layer],
+            clip: [0.0, 1.0],
+            fps: 30.0,
+            up: [0.0, 1.0, 0.0],
+            head: Head::Features,
+            ..Scene::default()
+        }
     }
 
     fn around(from: f64, count: usize) -> Vec<(f64, Camera)> {
