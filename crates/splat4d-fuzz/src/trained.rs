@@ -4,11 +4,10 @@ use crate::Reader;
 use crate::captures;
 use crate::formats::moving;
 use serde_json::{Map, json};
-use splat4d::format::npy;
+use splat4d::format::{npy, safetensors::SafeTensors};
 use splat4d::layers::Scene;
 use splat4d_train::capture::Capture;
-use splat4d_train::eval::run::check_lpips;
-use splat4d_train::eval::{points, tracks};
+use splat4d_train::eval::{Lpips, points, tracks};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::probe::Probe;
 use std::cell::{OnceCell, RefCell};
@@ -105,6 +104,16 @@ fn lpips_headers() -> Vec<Vec<u8>> {
 
 /// Space for a header before the numbers, which are made once.
 const HEADER: usize = 1 << 14;
+
+/// Reads weights as `eval` does.
+fn check_lpips(bytes: &[u8]) -> splat4d::Result<()> {
+    let file = SafeTensors::read(bytes)?;
+    let tensor = |name: &str| {
+        let tensor = file.tensor(name).ok()?;
+        Some((tensor.shape().to_vec(), tensor.as_f32().ok()?.to_vec()))
+    };
+    Lpips::load(tensor).map(drop)
+}
 
 /// Calls `f` with the file that begins with this header.
 fn lpips(header: &[u8], f: impl FnOnce(&[u8])) {

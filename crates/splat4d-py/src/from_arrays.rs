@@ -3,13 +3,12 @@
 use crate::arrays::{Kind, finite, finite_rows, numbers, pixels};
 use crate::camera::Camera;
 use crate::errors::{OrRaise, bad_input};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 use splat4d::{Error, Result, scene};
 use splat4d_train::capture::PointCloud;
+use splat4d_train::encode::{self, Pixels};
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
@@ -29,10 +28,10 @@ pub(crate) struct Arrays<'a, 'py> {
     pub(crate) hold_out: Option<Vec<String>>,
 }
 
-/// An image's samples, row by row, in native order.
-struct Samples {
-    data: Vec<u8>,
-    kind: ExtendedColorType,
+/// An image's samples, row by row.
+enum Samples {
+    Eight(Vec<u8>),
+    Sixteen(Vec<u16>),
 }
 
 /// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a
@@ -252,29 +251,29 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
         Kind::Bytes => {
             let array = numbers::<u8>(&image, what)?;
             fits(array.shape())?;
-            Ok(Samples { data: array.as_array().iter().copied().collect(), kind: ExtendedColorType::Rgb8 })
+            Ok(Samples::Eight(array.as_array().iter().copied().collect()))
         }
         Kind::Floats => {
             let array = numbers::<f32>(&image, what)?;
             fits(array.shape())?;
-            let mut out = Vec::with_capacity(2 * array.len());
+            let mut out = Vec::with_capacity(array.len());
             for (i, x) in array.as_array().iter().enumerate() {
                 if !(0.0..=1.0).contains(x) {
                     let pixel = i / 3;
                     let place = format!("row {}, column {}", pixel / camera.width, pixel % camera.width);
                     return Err(bad_input(format!("{what} is {x} at {place}"), "Give floats from 0 to 1, or uint8"));
                 }
-                out.extend(((x * LEVELS).round() as u16).to_ne_bytes());
+                out.push((x * LEVELS).round() as u16);
             }
-            Ok(Samples { data: out, kind: ExtendedColorType::Rgb16 })
+            Ok(Samples::Sixteen(out))
         }
     }
 }
 
 fn store(samples: &Samples, camera: &scene::Camera, path: &Path) -> Result<()> {
-    let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(&samples.data, camera.width as u32, camera.height as u32, samples.kind)
-        .map_err(|e| Error::input(format!("an image cannot be stored ({e})")).at(path.display()))?;
-    write_atomically(path, &bytes)
+    let pixels = match samples {
+        Samples::Eight(samples) => Pixels::Eight(samples),
+        Samples::Sixteen(samples) => Pixels::Sixteen(samples),
+    };
+    write_atomically(path, &encode::png(pixels, [camera.width, camera.height], 3))
 }

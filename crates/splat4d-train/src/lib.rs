@@ -30,6 +30,7 @@
 //! | `settings.rs`, `settings/` | `settings!`: typed settings with defaults, ranges, units and documentation, declared next to what they set |
 //! | `event.rs` | events that the trainer emits |
 //! | `path_text.rs`, `files.rs` | paths that are not UTF-8 as text; opens regular files only |
+//! | `encode.rs` | images as PNG and JPEG files, and in another size |
 //! | `keypoints/` | SIFT keypoints and the image filters that they need |
 //! | `capture/` | layouts read into one `Capture`, chosen by `layout.rs`; file lookup (`lookup.rs`), masks, findings (`account.rs`), pose conventions (`convention.rs`), depth, flow and tracks, photos or videos without times (`sequence.rs`), a model next to other poses (`beside.rs`), the image store with a byte budget, captures far from the origin (`offset.rs`), panoramas |
 //! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/`, `capture/lookup/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right; images of one name with two endings |
@@ -57,6 +58,7 @@
 mod blended;
 pub mod capture;
 pub mod compress;
+pub mod encode;
 pub mod eval;
 pub mod event;
 pub mod features;

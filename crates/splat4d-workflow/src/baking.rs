@@ -13,7 +13,6 @@ use crate::run_folder::Run;
 use crate::sound;
 pub use crate::sound::SoundChoice;
 use crate::source::{Source, not_empty};
-use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
 use splat4d::bake::{self, Bakery, Curve, Cut, Options, Shown};
 use splat4d::device;
@@ -24,6 +23,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, RenderConfig};
 use splat4d::scene::{Camera, GEOMETRY, Time};
 use splat4d::{Error, Result};
+use splat4d_train::encode;
 use std::path::Path;
 
 /// Cameras that are static and times at which baked and model are compared; every one costs two renders.
@@ -613,9 +613,7 @@ pub fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<
         let shrink = camera.width.max(camera.height).div_ceil(side).max(1);
         painter.draw(&camera.downscaled(shrink), scene.clip[0]);
         let rgb = color_rgb(&painter.image.color);
-        let picture = image::RgbImage::from_raw(rgb.width as u32, rgb.height as u32, rgb.data)?;
-        let mut bytes = Vec::new();
-        JpegEncoder::new_with_quality(&mut bytes, quality).encode_image(&picture).ok()?;
+        let bytes = encode::jpeg(&rgb.data, [rgb.width, rgb.height], quality).ok()?;
         (bytes.len() <= POSTER_BYTES).then_some(bytes)
     })
 }

@@ -1,9 +1,6 @@
 //! Cameras, images and points of a capture, for the player's page: `view` of a capture or a run, and `train --view`.
 
-use crate::draw::color_rgb;
-use image::RgbImage;
-use image::codecs::jpeg::JpegEncoder;
-use image::imageops::{FilterType, resize};
+use crate::draw::{Rgb, color_rgb};
 use serde_json::{Value, json};
 use splat4d::format::playback::NamedCamera;
 use splat4d::layers::{Layer, Scene};
@@ -12,6 +9,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
 use splat4d_serve::{Photo, PhotoQuery, Photos};
 use splat4d_train::capture::{Capture, ImageStore, PointCloud, Split};
+use splat4d_train::encode;
 use std::sync::Arc;
 
 /// Most cameras that a page draws and lists.
@@ -87,21 +85,20 @@ fn find(store: &ImageStore, list: &[Listed], wanted: &PhotoQuery) -> Option<Phot
     let away = |i: &usize| (frames[*i].time.0 - wanted.time).abs();
     let nearest = list.get(wanted.view)?.frames.iter().copied().min_by(|a, b| away(a).total_cmp(&away(b)))?;
     let rgb = color_rgb(&store.load(nearest).ok()?.to_picture().color);
-    let picture = RgbImage::from_raw(rgb.width as u32, rgb.height as u32, rgb.data)?;
-    let picture = reduced(picture, wanted.side as u32);
-    let mut jpeg = Vec::new();
-    JpegEncoder::new_with_quality(&mut jpeg, QUALITY).encode_image(&picture).ok()?;
+    let Rgb { width, height, data } = reduced(rgb, wanted.side);
+    let jpeg = encode::jpeg(&data, [width, height], QUALITY).ok()?;
     Some(Photo { jpeg, time: frames[nearest].time.0 })
 }
 
 /// An image whose longer side has at most this many pixels.
-fn reduced(picture: RgbImage, side: u32) -> RgbImage {
-    let (w, h) = picture.dimensions();
-    if w.max(h) <= side {
+fn reduced(picture: Rgb, side: usize) -> Rgb {
+    let longest = picture.width.max(picture.height);
+    if longest <= side {
         return picture;
     }
-    let scaled = |x: u32| ((u64::from(x) * u64::from(side)) / u64::from(w.max(h))).max(1) as u32;
-    resize(&picture, scaled(w), scaled(h), FilterType::Triangle)
+    let size = [picture.width, picture.height];
+    let [width, height] = size.map(|x| (x * side / longest).max(1));
+    Rgb { width, height, data: encode::resample(&picture.data, 3, size, [width, height]) }
 }
 
 /// The points of a capture as a static scene of dots over the capture's time; a capture without points has one dot

@@ -17,6 +17,7 @@ use splat4d::play::Player;
 use splat4d::render::{Abilities, Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
 use splat4d::{Error, Result};
+use splat4d_train::encode::{self, Pixels};
 use splat4d_train::labels::best;
 
 pub use exposing::{Course, Exposure, Light};
@@ -157,20 +158,8 @@ pub struct Rgb {
 impl Rgb {
     /// The bytes of a PNG file.
     pub fn png(&self) -> Vec<u8> {
-        png_of(&self.data, [self.width, self.height], png::ColorType::Rgb)
+        encode::png(Pixels::Eight(&self.data), [self.width, self.height], 3)
     }
-}
-
-/// The bytes of a PNG file of 8-bit samples.
-fn png_of(data: &[u8], [width, height]: [usize; 2], color: png::ColorType) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, width as u32, height as u32);
-    encoder.set_color(color);
-    encoder.set_depth(png::BitDepth::Eight);
-    encoder.set_compression(png::Compression::Fast);
-    let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(data);
-    write(encoder).expect("an image in memory can be encoded");
-    bytes
 }
 
 /// Renders, on the CPU by default; memory is reused from image to image.

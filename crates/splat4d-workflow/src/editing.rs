@@ -17,7 +17,7 @@ use splat4d::{Error, Result};
 #[cfg(feature = "dynamics")]
 use splat4d_dynamics::{nodes::follow_among, paths::Pose};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 use splat4d_train::eval::floaters::support;
 use splat4d_train::eval::metrics::psnr;
 use splat4d_train::output::rfc3339;
@@ -33,6 +33,8 @@ const MOST_MASKS: usize = 120;
 const COMPARED: usize = 40;
 /// Above this a mask's pixel is white, of 1.
 const WHITE: f32 = 0.5;
+/// Weights of red, green and blue in the brightness of a mask in colour (ITU-R BT.709).
+const LUMA: [f32; 3] = [0.2126, 0.7152, 0.0722];
 
 /// Times of the clip at which [`EditOptions::count`] counts what is visible.
 const MOMENTS: usize = 5;
@@ -223,20 +225,12 @@ impl Context for Bring<'_> {
     }
 
     fn mask(&self, name: &str, camera: &Camera) -> Result<Mask> {
+        let luma = |rgb: &[u8]| LUMA.iter().zip(rgb).map(|(w, &v)| w * f32::from(v) / 255.0).sum::<f32>();
         let path = self.file(name);
-        let unread = |e: image::ImageError| {
-            Error::input(format!("the image cannot be read ({e})")).at(path.display()).remedy("Give a PNG.")
-        };
-        let open = || {
-            let opened = image::ImageReader::new(std::io::BufReader::new(files::open(&path)?));
-            opened.with_guessed_format().map_err(|e| files::cannot_read(&path, e))
-        };
         // The header's size first: a small file may claim gigabytes of pixels.
-        let (width, height) = open()?.into_dimensions().map_err(unread)?;
-        mask_fits([width as usize, height as usize], camera, name)?;
-        let grey = open()?.decode().map_err(unread)?.to_luma8();
-        let (width, height) = (grey.width() as usize, grey.height() as usize);
-        Ok(Mask { width, height, white: grey.into_raw().into_iter().map(|v| v >= 128).collect() })
+        mask_fits(Rgb8::size(&path)?, camera, name)?;
+        let Rgb8 { width, height, data } = Rgb8::read(&path)?;
+        Ok(Mask { width, height, white: data.chunks_exact(3).map(|rgb| luma(rgb) > WHITE).collect() })
     }
 
     fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {

@@ -9,7 +9,6 @@ use crate::events::{Listener, ignore};
 use crate::files;
 use crate::picking::{Drawn, Shape, draw, number, there};
 use crate::source::Source;
-use image::codecs::jpeg::JpegEncoder;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use splat4d::device;
@@ -20,6 +19,7 @@ use splat4d::render::{Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Intrinsics, Lens, Time};
 use splat4d::{Error, Result};
 use splat4d_serve::EditResponse;
+use splat4d_train::encode;
 use std::path::{Component, Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -377,10 +377,7 @@ impl Editor {
 /// An image as a data URI.
 fn jpeg(image: &Image<f32>) -> Result<String> {
     let rgb = color_rgb(&image.color);
-    let mut bytes = Vec::new();
-    image::RgbImage::from_raw(rgb.width as u32, rgb.height as u32, rgb.data)
-        .and_then(|picture| JpegEncoder::new_with_quality(&mut bytes, QUALITY).encode_image(&picture).ok())
-        .ok_or_else(|| Error::input("the image cannot be encoded"))?;
+    let bytes = encode::jpeg(&rgb.data, [rgb.width, rgb.height], QUALITY)?;
     Ok(format!("data:image/jpeg;base64,{}", files::base64(&bytes)))
 }
 

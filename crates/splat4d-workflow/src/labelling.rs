@@ -152,7 +152,7 @@ fn learn_labels(
                 "labels".into(),
                 json!({
                     "names": scores.names, "views": views, "pictures": scores.pictures, "accuracy": scores.accuracy,
-                    "mean_iou": scores.mean_iou(), "iou": scores.iou, "cross_entropy": losses,
+                    "mean_iou": scores.mean_iou, "iou": scores.iou, "cross_entropy": losses,
                 }),
             )],
         )?;
@@ -176,7 +176,7 @@ fn in_words(scores: &LabelScores, views: &str) -> String {
         "labels of {} {views} views: {:.1} % of the pixels correct, mean IoU {:.3} ({})",
         scores.pictures,
         100.0 * scores.accuracy,
-        scores.mean_iou(),
+        scores.mean_iou,
         each.join(", ")
     )
 }

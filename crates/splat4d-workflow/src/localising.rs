@@ -71,15 +71,15 @@ pub fn localise(
         })?;
         console.clear();
         let row = row(&located, &name, found.len());
-        if located.is_sure() {
+        if located.sure {
             console.result(&in_words(&located, &name));
             console.emit(&json!({"type": "located", "picture": path.to_string_lossy(), "camera": row}));
             found.push(row);
         } else {
             console
                 .emit(&json!({"type": "not_located", "picture": path.to_string_lossy(), "residual": located.residual,
-                "share": located.share()}));
-            lost.push(format!("{name} ({:.0} % of a plain colour's difference)", 100.0 * located.share()));
+                "share": located.share}));
+            lost.push(format!("{name} ({:.0} % of a plain colour's difference)", 100.0 * located.share));
         }
     }
     if let (Some(output), false) = (&options.output, found.is_empty()) {
@@ -162,7 +162,7 @@ fn row(located: &Located, name: &str, id: usize) -> Value {
     let view = View { camera: located.camera.clone(), name: name.to_owned(), time: located.time.0, held: false };
     let mut row = view_json(id, &view);
     row["residual"] = json!(located.residual);
-    row["share"] = json!(located.share());
+    row["share"] = json!(located.share);
     row
 }
 
@@ -177,6 +177,6 @@ fn in_words(located: &Located, name: &str) -> String {
         axis[2],
         located.time.0,
         located.residual,
-        100.0 * located.share()
+        100.0 * located.share
     )
 }

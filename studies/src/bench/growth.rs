@@ -202,7 +202,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         labels: Vec::new(),
         downscale: 1,
         convention: Convention::OPENCV,
-        poses: Poses::STATED,
+        poses: Poses::default(),
         lenses: Lenses::default(),
         account: Vec::new(),
         warnings: Vec::new(),

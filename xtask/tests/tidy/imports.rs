@@ -23,6 +23,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "path_text",
             "text",
             "files",
+            "encode",
             "keypoints",
             "capture",
             "vision",

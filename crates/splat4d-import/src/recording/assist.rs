@@ -10,13 +10,12 @@ use crate::sfm::lens::Known;
 use crate::sync::graph;
 use crate::write::Pictures;
 use crate::{Error, Result};
-use image::codecs::jpeg::JpegEncoder;
-use image::{ExtendedColorType, ImageEncoder};
 use serde_json::{Value, json};
 use splat4d::math::Se3;
 use splat4d::math::se3::{add, mat_vec, norm, scale, sub, transpose};
 use splat4d::scene::{Intrinsics, Lens as SceneLens};
 use splat4d_train::capture::{Distortion, Rgb8};
+use splat4d_train::encode;
 use splat4d_train::event::Progress;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
@@ -463,12 +462,7 @@ impl Desk {
             splat4d_train::files::read(&path).ok()?
         } else {
             let picture = Rgb8::read(&path).ok()?;
-            let mut bytes = Vec::new();
-            let (width, height) = (picture.width as u32, picture.height as u32);
-            JpegEncoder::new_with_quality(&mut bytes, QUALITY)
-                .write_image(&picture.data, width, height, ExtendedColorType::Rgb8)
-                .ok()?;
-            bytes
+            encode::jpeg(&picture.data, [picture.width, picture.height], QUALITY).ok()?
         };
         Some((jpeg, p.shots[nearest].time))
     }

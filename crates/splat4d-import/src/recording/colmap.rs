@@ -3,8 +3,7 @@
 use super::stored::Stored;
 use crate::calibration::{self, Calibration};
 use crate::{Error, ErrorKind, Result};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
+use splat4d_train::encode::{self, Pixels};
 use splat4d_train::event::Progress;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::fs::File;
@@ -116,10 +115,7 @@ fn prepare(stored: &Stored<'_>, work: &Path, progress: &mut Progress<'_>) -> Res
     for (c, p) in stored.pictures.iter().enumerate() {
         progress.phase("images for COLMAP", c, stored.pictures.len());
         let still = stored.median(c, |picture| picture)?;
-        let mut bytes = Vec::new();
-        PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-            .write_image(&still.data, still.width as u32, still.height as u32, ExtendedColorType::Rgb8)
-            .map_err(|e| Error::input(format!("an image cannot be stored ({e})")))?;
+        let bytes = encode::png(Pixels::Eight(&still.data), [still.width, still.height], 3);
         write_atomically(&work.join("images").join(format!("{}.png", p.name)), &bytes)?;
         if let Some(masks) = stored.masks.get(c) {
             let from = stored.folder.join(&masks.files[p.shots.len() / 2]);

@@ -1,8 +1,8 @@
 //! Folders of images, and image sequences: numbers in names are the clock.
 
 use super::{Color, Frame, Info, Range, Reader, Rgb8, Selection, Source, Transfer, fingerprint_of_file, fnv1a, stem};
-use image::imageops::{FilterType, resize};
 use splat4d::{Error, Result};
+use splat4d_train::encode::resample;
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
@@ -166,10 +166,8 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     if [width, height] == [picture.width, picture.height] {
         return picture;
     }
-    let whole = image::RgbImage::from_raw(picture.width as u32, picture.height as u32, picture.data);
-    let whole = whole.expect("an image has width·height·3 samples");
     // The same kind of curve as ffmpeg's; both widen it where images get smaller.
-    let data = resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw();
+    let data = resample(&picture.data, 3, [picture.width, picture.height], [width, height]);
     Rgb8 { width, height, data }
 }
 
@@ -183,9 +181,7 @@ fn scaled_plane(alpha: Vec<u8>, size: [usize; 2], selection: &Selection) -> Vec<
     if [width, height] == size {
         return alpha;
     }
-    let whole = image::GrayImage::from_raw(size[0] as u32, size[1] as u32, alpha);
-    let whole = whole.expect("there is a sample for each pixel");
-    resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw()
+    resample(&alpha, 1, size, [width, height])
 }
 
 fn name(path: &Path) -> String {

@@ -2,11 +2,10 @@
 
 use super::Pictures;
 use crate::video::fnv1a;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::Rgb8;
+use splat4d_train::encode::{self, Pixels};
 use splat4d_train::event::Progress;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
@@ -127,10 +126,7 @@ fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let value =
         |x: usize, y: usize| mask.data[3 * (y * mask.height / height * mask.width + x * mask.width / width)] * gain;
     let data: Vec<u8> = (0..width * height).map(|p| value(p % width, p / width)).collect();
-    let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(&data, width as u32, height as u32, ExtendedColorType::L8)
-        .map_err(|e| Error::input(format!("the mask cannot be stored ({e})")).at(from.display()))?;
+    let bytes = encode::png(Pixels::Eight(&data), [width, height], 1);
     write_atomically(to, &bytes)?;
     Ok(fnv1a(&bytes))
 }

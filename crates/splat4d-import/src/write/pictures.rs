@@ -1,12 +1,10 @@
 //! Frames of videos as image files, and a table of their times.
 
 use crate::video::{Clock, Frame, Gap, Rgb8, Selection, Source, fnv1a, mean_difference};
-use image::codecs::jpeg::JpegEncoder;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::encode::{self, Pixels};
 use splat4d_train::event::Progress;
 use splat4d_train::output::{write_atomically, written};
 use std::collections::BTreeSet;
@@ -49,28 +47,16 @@ impl Format {
     }
 
     fn encode(self, picture: &Rgb8, alpha: &[u8]) -> Result<Vec<u8>> {
-        let mut bytes = Vec::new();
-        let (width, height) = (picture.width as u32, picture.height as u32);
+        let size = [picture.width, picture.height];
         if !alpha.is_empty() {
             let pixels = picture.data.chunks_exact(3).zip(alpha);
             let rgba: Vec<u8> = pixels.flat_map(|(rgb, a)| [rgb[0], rgb[1], rgb[2], *a]).collect();
-            PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-                .write_image(&rgba, width, height, ExtendedColorType::Rgba8)
-                .map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
-            return Ok(bytes);
+            return Ok(encode::png(Pixels::Eight(&rgba), size, 4));
         }
-        let done = match self {
-            Self::Jpeg(quality) => JpegEncoder::new_with_quality(&mut bytes, quality).write_image(
-                &picture.data,
-                width,
-                height,
-                ExtendedColorType::Rgb8,
-            ),
-            Self::Png => PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-                .write_image(&picture.data, width, height, ExtendedColorType::Rgb8),
-        };
-        done.map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
-        Ok(bytes)
+        match self {
+            Self::Jpeg(quality) => encode::jpeg(&picture.data, size, quality),
+            Self::Png => Ok(encode::png(Pixels::Eight(&picture.data), size, 3)),
+        }
     }
 }
 

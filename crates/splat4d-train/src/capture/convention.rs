@@ -131,7 +131,7 @@ fn flip_columns(pose: &mut Se3) {
 }
 
 /// Convention of a file's poses, if it is not that of the layout.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Poses {
     /// Whether the camera's axes are OpenGL's; `None`: as stated.
     opengl: Option<bool>,
@@ -145,7 +145,7 @@ pub struct Poses {
 
 impl Poses {
     /// As the layout states.
-    pub const STATED: Self = Self { opengl: None, inverse: false, transposed: false, xyzw: false };
+    pub(crate) const STATED: Self = Self { opengl: None, inverse: false, transposed: false, xyzw: false };
     const WORDS: [&str; 5] = ["opencv", "opengl", "inverse", "transposed", "xyzw"];
 
     /// The convention found for the poses, as text; relative to what `stated` states.

@@ -151,15 +151,15 @@ fn decode_npy(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     encode(path, width, (0..n).map(|p| [at(p, 0), at(p, 1), if channels == 3 { at(p, 2) } else { 1.0 }]))
 }
 
-/// A 16-bit RGB image in KITTI's code of flow and where it is known, [3, height, width].
-pub(crate) fn to_picture(flow: &Planes<f32>) -> image::ImageBuffer<image::Rgb<u16>, Vec<u16>> {
-    let (w, n) = (flow.width, flow.pixels());
-    image::ImageBuffer::from_fn(w as u32, flow.height as u32, |x, y| {
-        let p = y as usize * w + x as usize;
+/// The samples of a 16-bit RGB image in KITTI's code: of flow and where it is known, [3, height, width].
+pub(crate) fn to_picture(flow: &Planes<f32>) -> Vec<u16> {
+    let n = flow.pixels();
+    let code = |p: usize| {
         let codes = [0, 1].map(|c| (f64::from(flow.data[c * n + p]) * PER_PIXEL + ZERO).round());
         let fits = codes.iter().all(|c| (0.0..=f64::from(u16::MAX)).contains(c));
-        image::Rgb(if flow.data[2 * n + p] > 0.0 && fits { [codes[0] as u16, codes[1] as u16, 1] } else { [0; 3] })
-    })
+        if flow.data[2 * n + p] > 0.0 && fits { [codes[0] as u16, codes[1] as u16, 1] } else { [0; 3] }
+    };
+    (0..n).flat_map(code).collect()
 }
 
 fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {

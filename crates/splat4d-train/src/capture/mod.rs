@@ -41,6 +41,7 @@ mod points;
 mod pose;
 mod posed;
 mod preflight;
+mod raster;
 mod rgb8;
 mod rig;
 mod sequence;

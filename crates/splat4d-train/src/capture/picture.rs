@@ -1,9 +1,9 @@
 //! Image files: headers without pixels, and upright pixels in planes. JPEG, PNG and WebP; EXIF orientation honoured.
 
+use super::raster::{Opened, Orientation};
+pub(super) use super::raster::{Raster, Samples};
 use super::{json, pose};
 use crate::files;
-use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageReader};
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
@@ -25,50 +25,12 @@ pub(super) struct Header {
 impl Header {
     /// The size after its EXIF orientation is applied.
     pub(super) fn upright(&self) -> (usize, usize) {
-        let (width, height) = self.stored;
-        if swaps_sides(self.orientation) { (height, width) } else { (width, height) }
+        self.orientation.size(self.stored)
     }
 
     /// Whether EXIF states that pixels are to be turned or mirrored.
     pub(super) fn is_turned(&self) -> bool {
-        self.orientation != Orientation::NoTransforms
-    }
-}
-
-/// Decoded samples.
-#[derive(Debug, PartialEq)]
-pub(super) enum Samples {
-    /// 8 bits per sample.
-    Eight(Vec<u8>),
-    /// 16 bits per sample.
-    Sixteen(Vec<u16>),
-}
-
-/// An upright decoded image.
-pub(super) struct Raster {
-    /// Pixels across.
-    pub width: usize,
-    /// Pixels down.
-    pub height: usize,
-    /// 1 grey, 2 grey and alpha, 3 RGB, 4 RGB and alpha.
-    pub channels: usize,
-    /// width·height·channels samples.
-    pub samples: Samples,
-}
-
-impl Raster {
-    /// One sample from 0 to 1.
-    pub(crate) fn get(&self, pixel: usize, channel: usize) -> f32 {
-        let i = pixel * self.channels + channel;
-        match &self.samples {
-            Samples::Eight(s) => f32::from(s[i]) / 255.0,
-            Samples::Sixteen(s) => f32::from(s[i]) / 65535.0,
-        }
-    }
-
-    /// The channel that holds alpha.
-    pub(crate) fn alpha(&self) -> Option<usize> {
-        self.channels.is_multiple_of(2).then(|| self.channels - 1)
+        self.orientation != Orientation::default()
     }
 }
 
@@ -150,20 +112,17 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     };
     let mut file = BufReader::new(files::open(path)?);
     let jpeg = is_jpeg(file.fill_buf().map_err(fail)?);
-    let (width, height, alpha, orientation) = if jpeg {
+    let (stored, alpha, orientation) = if jpeg {
         let mut decoder = JpegDecoder::new(file);
         decoder.decode_headers().map_err(|e| broken(path, e))?;
         let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
-        let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
-        (usize::from(info.width), usize::from(info.height), false, orientation)
+        let orientation = decoder.exif().and_then(|e| Orientation::of_exif(e)).unwrap_or_default();
+        ((usize::from(info.width), usize::from(info.height)), false, orientation)
     } else {
-        let mut decoder = open(file, path)?;
-        let (width, height) = decoder.dimensions();
-        let orientation = decoder.orientation().ok();
-        (width as usize, height as usize, decoder.color_type().has_alpha(), orientation)
+        let mut opened = Opened::read(file).map_err(|e| broken(path, e))?;
+        (opened.size(), opened.has_alpha(), opened.orientation())
     };
-    let orientation = orientation.unwrap_or(Orientation::NoTransforms);
-    Ok(Header { stored: (width, height), alpha, orientation })
+    Ok(Header { stored, alpha, orientation })
 }
 
 /// Bytes at the end of a file in which its end mark is, unless something else follows.
@@ -189,16 +148,6 @@ pub(super) fn check_end(path: &Path) -> Result<()> {
         return Ok(());
     }
     decode(path, None).map(drop)
-}
-
-fn swaps_sides(orientation: Orientation) -> bool {
-    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
-    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
-}
-
-fn open<'a>(source: impl BufRead + Seek + 'a, path: &Path) -> Result<impl ImageDecoder + 'a> {
-    let reader = ImageReader::new(source).with_guessed_format().map_err(|e| broken(path, e))?;
-    reader.into_decoder().map_err(|e| broken(path, e))
 }
 
 /// How far the shape of a resized image may be from the one that its intrinsics are for; more was cropped or padded.
@@ -283,12 +232,11 @@ pub(super) fn decode_bytes(bytes: &[u8], path: &Path, expected: Option<&Camera>)
 }
 
 fn decode_either(bytes: &[u8], path: &Path, expected: Option<&Camera>, upright: bool) -> Result<Raster> {
-    let kept = |orientation: Orientation| if upright { orientation } else { Orientation::NoTransforms };
+    let kept = |orientation: Orientation| if upright { orientation } else { Orientation::default() };
     if is_jpeg(bytes) { decode_jpeg(bytes, path, expected, kept) } else { decode_other(bytes, path, expected, kept) }
 }
 
-fn admit(path: &Path, size: (usize, usize), turned: bool, expected: Option<&Camera>) -> Result<()> {
-    let size = if turned { (size.1, size.0) } else { size };
+fn admit(path: &Path, size: (usize, usize), expected: Option<&Camera>) -> Result<()> {
     match expected {
         Some(camera) => check_size(path, size, camera),
         None => pose::check_size(size.0, size.1).map_err(|e| e.at(path.display())),
@@ -311,14 +259,14 @@ fn decode_jpeg(
     let mut decoder = JpegDecoder::new_with_options(Cursor::new(bytes), options);
     decoder.decode_headers().map_err(|e| broken(path, e))?;
     let info = decoder.info().ok_or_else(|| broken(path, "no header"))?;
-    let orientation = decoder.exif().and_then(|e| Orientation::from_exif_chunk(e));
-    let orientation = kept(orientation.unwrap_or(Orientation::NoTransforms));
+    let orientation = kept(decoder.exif().and_then(|e| Orientation::of_exif(e)).unwrap_or_default());
     let (width, height) = (usize::from(info.width), usize::from(info.height));
-    admit(path, (width, height), swaps_sides(orientation), expected)?;
+    admit(path, orientation.size((width, height)), expected)?;
     let pixels = decoder.decode().map_err(|e| broken(path, e))?;
-    let buffer = image::RgbImage::from_raw(width as u32, height as u32, pixels);
-    let picture = buffer.ok_or_else(|| broken(path, "fewer pixels than its header states"))?;
-    Ok(upright(DynamicImage::ImageRgb8(picture), orientation))
+    if pixels.len() != 3 * width * height {
+        return Err(broken(path, "fewer pixels than its header states"));
+    }
+    Ok(Raster { width, height, channels: 3, samples: Samples::Eight(pixels) }.turned(orientation))
 }
 
 /// Whether a JPEG's data is followed by its end mark. The decoder fills what is missing with grey, so that a truncated
@@ -350,29 +298,10 @@ fn decode_other(
     expected: Option<&Camera>,
     kept: impl Fn(Orientation) -> Orientation,
 ) -> Result<Raster> {
-    let mut decoder = open(Cursor::new(bytes), path)?;
-    let (width, height) = decoder.dimensions();
-    let orientation = kept(decoder.orientation().unwrap_or(Orientation::NoTransforms));
-    admit(path, (width as usize, height as usize), swaps_sides(orientation), expected)?;
-    let picture = DynamicImage::from_decoder(decoder).map_err(|e| broken(path, e))?;
-    Ok(upright(picture, orientation))
-}
-
-fn upright(mut picture: DynamicImage, orientation: Orientation) -> Raster {
-    picture.apply_orientation(orientation);
-    let (width, height) = (picture.width() as usize, picture.height() as usize);
-    let (channels, samples) = match picture {
-        DynamicImage::ImageLuma8(p) => (1, Samples::Eight(p.into_raw())),
-        DynamicImage::ImageLumaA8(p) => (2, Samples::Eight(p.into_raw())),
-        DynamicImage::ImageRgb8(p) => (3, Samples::Eight(p.into_raw())),
-        DynamicImage::ImageRgba8(p) => (4, Samples::Eight(p.into_raw())),
-        DynamicImage::ImageLuma16(p) => (1, Samples::Sixteen(p.into_raw())),
-        DynamicImage::ImageLumaA16(p) => (2, Samples::Sixteen(p.into_raw())),
-        DynamicImage::ImageRgb16(p) => (3, Samples::Sixteen(p.into_raw())),
-        DynamicImage::ImageRgba16(p) => (4, Samples::Sixteen(p.into_raw())),
-        other => (4, Samples::Sixteen(other.into_rgba16().into_raw())),
-    };
-    Raster { width, height, channels, samples }
+    let mut opened = Opened::read(Cursor::new(bytes)).map_err(|e| broken(path, e))?;
+    let orientation = kept(opened.orientation());
+    admit(path, orientation.size(opened.size()), expected)?;
+    Ok(opened.decode().map_err(|e| broken(path, e))?.turned(orientation))
 }
 
 /// The largest number that is a label, not a brightness.

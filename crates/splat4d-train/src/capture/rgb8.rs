@@ -16,6 +16,13 @@ pub struct Rgb8 {
 }
 
 impl Rgb8 {
+    /// Pixels across and down of the image in a file, upright, from its header alone.
+    ///
+    /// Errors: as [`read`](Self::read).
+    pub fn size(path: &Path) -> Result<[usize; 2]> {
+        picture::header(path).map(|header| header.upright().into())
+    }
+
     /// The image in a JPEG, PNG or WebP file, upright; 16 bits are rounded to 8, alpha is left out.
     ///
     /// Errors: no such file, a damaged one or one of another kind.

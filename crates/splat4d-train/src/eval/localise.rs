@@ -5,7 +5,7 @@
 //! larger and larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the
 //! focal length where it is requested, so that derivatives are differences of renders. A gain and an offset of each
 //! colour are free, since another camera has another exposure. What does not fit the scene much better than one plain
-//! colour would is refused ([`Located::is_sure`]).
+//! colour would is refused ([`Located::sure`]).
 
 use crate::Result;
 use crate::train_state::moved;
@@ -66,20 +66,12 @@ pub struct Located {
     pub residual: f64,
     /// The same from the plain colour that is its mean: what a scene that has nothing to do with it may reach.
     pub chance: f64,
+    /// The residual, a share of what chance may reach.
+    pub share: f64,
+    /// Whether the scene explains the image.
+    pub sure: bool,
     /// The start that led here.
     pub start: usize,
-}
-
-impl Located {
-    /// The residual, a share of what chance may reach.
-    pub fn share(&self) -> f64 {
-        if self.chance > 0.0 { self.residual / self.chance } else { f64::INFINITY }
-    }
-
-    /// Whether the scene explains the image.
-    pub fn is_sure(&self) -> bool {
-        self.share() <= SURE
-    }
 }
 
 /// One candidate on its way.
@@ -135,7 +127,9 @@ pub fn localise(
     let best = candidates.swap_remove(0);
     let (small, times) = shrunk(picture, LEVELS[LEVELS.len() - 1].0);
     let residual = search.compared(&best, &small, times)?.difference;
-    Ok(Located { camera: best.camera, time: Time(best.time), residual, chance, start: best.start })
+    let share = if chance > 0.0 { residual / chance } else { f64::INFINITY };
+    let (camera, time, start) = (best.camera, Time(best.time), best.start);
+    Ok(Located { camera, time, residual, chance, share, sure: share <= SURE, start })
 }
 
 impl Search<'_> {
@@ -411,15 +405,15 @@ mod tests {
             apart.iter().map(|x| x * x).sum::<f64>().sqrt()
         };
         assert!(off(&starts[2]) > 0.3 && off(&found.camera) < 0.03, "{}", off(&found.camera));
-        assert!((found.time.0 - when).abs() < 0.02 && found.is_sure() && found.start == 2, "{found:?}");
+        assert!((found.time.0 - when).abs() < 0.02 && found.sure && found.start == 2, "{found:?}");
         // Its own mirror image is none of the scene's views.
         let mut strange = drawn(&scene, &truth, when);
         for row in strange.data.chunks_mut(SIZE) {
             row.reverse();
         }
         let lost = localise(&scene, &strange, &starts, Query::default(), &mut |_, _| {}).unwrap();
-        assert!(!lost.is_sure(), "{lost:?}");
+        assert!(!lost.sure, "{lost:?}");
         (found.residual, found.chance) = (0.0, 0.0);
-        assert!(!found.is_sure(), "a picture of one colour tells nothing");
+        assert!(!found.sure, "a picture of one colour tells nothing");
     }
 }

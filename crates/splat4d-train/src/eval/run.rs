@@ -25,14 +25,13 @@ use super::metrics::{self, Flicker, TemporalMean};
 use super::report::METHOD;
 use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
 use crate::capture::{Capture, ImageStore, StoredPicture};
+use crate::encode::{self, Pixels};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
 use crate::run::corrected;
 use crate::step::shutter::{self, Taken};
 use crate::train_state::{EXPOSURE_COLUMNS, expose};
 use crate::{Error, ErrorKind, Result};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use splat4d::device::{self, Device, Opened};
@@ -503,21 +502,12 @@ fn foreground(stored: &StoredPicture) -> Option<Vec<bool>> {
 
 fn load_lpips(path: &Path) -> Result<Lpips> {
     let bytes = crate::files::read(path).map_err(|e| e.at("the LPIPS weights"))?;
-    lpips_of(&bytes).map_err(|e| e.at(path.display()))
-}
-
-fn lpips_of(bytes: &[u8]) -> Result<Lpips> {
-    let file = SafeTensors::read(bytes)?;
+    let file = SafeTensors::read(&bytes).map_err(|e| e.at(path.display()))?;
     let tensor = |name: &str| {
         let tensor = file.tensor(name).ok()?;
         Some((tensor.shape().to_vec(), tensor.as_f32().ok()?.to_vec()))
     };
-    Lpips::load(tensor)
-}
-
-/// Refuses bytes that are not LPIPS weights. Errors: what is wrong with them.
-pub fn check_lpips(bytes: &[u8]) -> Result<()> {
-    lpips_of(bytes).map(drop)
+    Lpips::load(tensor).map_err(|e| e.at(path.display()))
 }
 
 fn file_name(place: usize) -> String {
@@ -533,11 +523,7 @@ fn write_images(folder: &Path, place: usize, render: &Planes<f32>, truth: &Plane
 
 fn png(picture: &Planes<f32>) -> Vec<u8> {
     let data: Vec<u8> = picture.interleaved().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(&data, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
-        .expect("an image in memory can be encoded");
-    bytes
+    encode::png(Pixels::Eight(&data), [picture.width, picture.height], 3)
 }
 
 /// One value an image, by its file name.

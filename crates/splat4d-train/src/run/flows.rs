@@ -4,13 +4,14 @@
 use super::checkpoint::write_atomically;
 use super::identity::fingerprint;
 use super::open::{OpenCapture, training_frames};
+use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, FlowFile, FlowSource, flow_picture};
+use crate::encode::{self, Pixels};
 use crate::event::{Event, Progress};
 use crate::recipe::Recipe;
 use crate::vision::flow::{Pyramid, dense};
 use crate::vision::raster::grey;
-use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -45,12 +46,9 @@ pub(super) fn complete(
                 None => pyramid(&opened, *frame)?,
             };
             let to = pyramid(&opened, file.to)?;
-            let mut bytes = std::io::Cursor::new(Vec::new());
-            let picture = flow_picture(&dense(&from, &to));
-            picture
-                .write_to(&mut bytes, image::ImageFormat::Png)
-                .map_err(|e| Error::input(format!("the flow image cannot be made: {e}")).at(file.path.display()))?;
-            write_atomically(&file.path, &bytes.into_inner())?;
+            let flow = dense(&from, &to);
+            let picture = encode::png(Pixels::Sixteen(&flow_picture(&flow)), [flow.width, flow.height], 3);
+            write_atomically(&file.path, &picture)?;
             last = Some((file.to, to));
         }
         write_atomically(&run.join(FOLDER).join(MARK), mark.as_bytes())?;

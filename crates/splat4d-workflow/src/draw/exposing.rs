@@ -7,10 +7,11 @@
 //! part were measured and are not better (`studies/records/2026-11-28-film-renders.md`).
 
 use super::transfer::{add_light, display};
-use super::{Painter, Rgb, byte, color_rgb, png_of, shoot};
+use super::{Painter, Rgb, byte, color_rgb, shoot};
 use crate::paths::Shot as Frame;
 use splat4d::render::Shot;
 use splat4d::scene::{Camera, Planes, Time};
+use splat4d_train::encode::{self, Pixels};
 
 /// Angle between the points of a spiral that fills a disc evenly (Vogel 1979): the golden one.
 const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
@@ -52,7 +53,7 @@ impl Light {
     pub fn png(&self) -> Vec<u8> {
         let (color, alpha) = (color_rgb(&display(&self.color, Some(&self.alpha))), &self.alpha.data);
         let data: Vec<u8> = color.data.chunks(3).zip(alpha).flat_map(|(c, a)| [c[0], c[1], c[2], byte(*a)]).collect();
-        png_of(&data, [color.width, color.height], png::ColorType::Rgba)
+        encode::png(Pixels::Eight(&data), [color.width, color.height], 4)
     }
 
     /// sRGB values times alpha.

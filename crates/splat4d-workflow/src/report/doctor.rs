@@ -4,7 +4,6 @@ use super::chart::escape;
 use super::{STYLE, pictures, rig_map};
 use crate::events::Listener;
 use crate::files;
-use image::RgbImage;
 use splat4d::Result;
 use splat4d::scene::Camera;
 use splat4d_import::doctor::{CameraReport, Finding, Grade, Options, Report, examine};
@@ -93,8 +92,7 @@ fn page(report: &Report, capture: &Capture) -> String {
     );
     for camera in &report.cameras {
         let (p, view) = (&camera.picture, view_of(&camera.name));
-        let picture = RgbImage::from_raw(p.width as u32, p.height as u32, p.data.clone()).filter(|p| p.width() > 0);
-        let image = picture.and_then(pictures::reduced).map(|uri| {
+        let image = pictures::reduced(p).map(|uri| {
             format!(
                 "<img style=\"width:100%;border-radius:8px\" alt=\"camera {}\" src=\"{uri}\">",
                 escape(&camera.name)

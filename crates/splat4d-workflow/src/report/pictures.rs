@@ -3,15 +3,14 @@
 use crate::draw::Rgb;
 use crate::draw::color_rgb;
 use crate::files::{self, base64};
-use image::RgbImage;
-use image::codecs::jpeg::JpegEncoder;
-use image::imageops::{FilterType, resize};
 use splat4d::scene::Planes;
+use splat4d_train::capture::Rgb8;
+use splat4d_train::encode;
 use splat4d_train::eval::metrics::error_map;
 use std::path::{Path, PathBuf};
 
 /// Width of an image in the page, pixels: three fit side by side on a wide screen.
-const WIDTH: u32 = 420;
+const WIDTH: usize = 420;
 /// JPEG quality: no artefact that could be taken for one of the scene's.
 const QUALITY: u8 = 90;
 /// Largest film that is put inside the page, bytes; a larger one is linked.
@@ -25,35 +24,34 @@ pub(super) const DIFFERENCE_WORDS: &str = "a tenth";
 
 /// A JPEG data URI of an image file, reduced; `None` where it cannot be read.
 pub(super) fn inline(path: &Path) -> Option<String> {
-    reduced(image::open(path).ok()?.to_rgb8())
+    reduced(&Rgb8::read(path).ok()?)
 }
 
 /// The same of where two images differ; `None` where one cannot be read or their sizes differ.
 pub(super) fn difference(a: &Path, b: &Path) -> Option<String> {
     let read = |path: &Path| {
-        let picture = image::open(path).ok()?.to_rgb32f();
-        let (w, h) = picture.dimensions();
-        Some(Planes::from_interleaved(3, h as usize, w as usize, &picture.into_raw()))
+        let Rgb8 { width, height, data } = Rgb8::read(path).ok()?;
+        let unit: Vec<f32> = data.iter().map(|&v| f32::from(v) / 255.0).collect();
+        Some(Planes::from_interleaved(3, height, width, &unit))
     };
     let (a, b) = (read(a)?, read(b)?);
     if (a.width, a.height) != (b.width, b.height) {
         return None;
     }
     let Rgb { width, height, data } = color_rgb(&error_map(&a, &b, DIFFERENCE_FULL));
-    reduced(RgbImage::from_raw(width as u32, height as u32, data)?)
+    reduced(&Rgb8 { width, height, data })
 }
 
 /// A JPEG data URI of an image, reduced.
-pub(super) fn reduced(picture: RgbImage) -> Option<String> {
-    let (w, h) = picture.dimensions();
-    let picture: RgbImage = if w > WIDTH {
-        let height = ((u64::from(h) * u64::from(WIDTH)) / u64::from(w)).max(1) as u32;
-        resize(&picture, WIDTH, height, FilterType::Triangle)
+pub(super) fn reduced(picture: &Rgb8) -> Option<String> {
+    let size = [picture.width, picture.height];
+    let bytes = if picture.width > WIDTH {
+        let small = [WIDTH, (picture.height * WIDTH / picture.width).max(1)];
+        encode::jpeg(&encode::resample(&picture.data, 3, size, small), small, QUALITY)
     } else {
-        picture
+        encode::jpeg(&picture.data, size, QUALITY)
     };
-    let mut bytes = Vec::new();
-    JpegEncoder::new_with_quality(&mut bytes, QUALITY).encode_image(&picture).ok()?;
+    let bytes = bytes.ok()?;
     Some(format!("data:image/jpeg;base64,{}", base64(&bytes)))
 }
 

@@ -7,7 +7,8 @@
 use super::Chunked;
 use crate::Result;
 use crate::capture::frames::Picture;
-use crate::capture::{Capture, HoldOut};
+use crate::capture::{Capture, HoldOut, Rgb8};
+use crate::encode::{self, Pixels};
 use crate::event::Event;
 use crate::init::Source;
 use crate::recipe::{MotionName, Recipe};
@@ -18,14 +19,13 @@ use crate::run::session::{Outcome, TrainOptions};
 use crate::run::start::{resume_with, train as train_run};
 use crate::train_state::Exposure;
 use crate::vision::view::spread;
-use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use rayon::prelude::*;
 use serde_json::json;
+use splat4d::Error;
 use splat4d::format::{safetensors::SafeTensors, scene};
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, median_by};
 use splat4d::scene::{Camera, RowEdit, Space};
-use splat4d::{Error, ErrorKind};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -216,12 +216,12 @@ fn medians(
                     *count += u16::from(off as f32 > 3.0 * 255.0 * CHANGED);
                 });
             }
-            write_png(&folder.join(format!("images/{name}/{written}.png")), &middle, view, ExtendedColorType::Rgb8)?;
+            write_png(&folder.join(format!("images/{name}/{written}.png")), &middle, view, 3)?;
             written += 1;
         }
         let calm: Vec<u8> =
             changed.iter().map(|c| if f64::from(*c) <= CALM * f64::from(looked) { 255 } else { 0 }).collect();
-        write_png(&folder.join(format!("calm/{name}.png")), &calm, view, ExtendedColorType::L8)?;
+        write_png(&folder.join(format!("calm/{name}.png")), &calm, view, 1)?;
         let (k, pose) = (&view.intrinsics, &view.cam_from_world);
         let row = |r: usize| [pose.rotation[r][0], pose.rotation[r][1], pose.rotation[r][2], pose.translation[r]];
         cameras.push(json!({
@@ -265,12 +265,8 @@ fn median(pictures: &[Vec<u8>], i: usize) -> u8 {
     median_by(values, u8::cmp).expect("there are images")
 }
 
-fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) -> Result<()> {
-    let mut out = Vec::new();
-    PngEncoder::new(&mut out)
-        .write_image(data, view.width as u32, view.height as u32, color)
-        .map_err(|e| Error::new(ErrorKind::Io, format!("an image cannot be encoded: {e}")).at(path.display()))?;
-    write_atomically(path, &out)
+fn write_png(path: &Path, data: &[u8], view: &Camera, channels: usize) -> Result<()> {
+    write_atomically(path, &encode::png(Pixels::Eight(data), [view.width, view.height], channels))
 }
 
 /// Keeps the Gaussians of a scene in static image regions.
@@ -279,11 +275,9 @@ fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result
     for (rig, camera) in capture.cameras.iter().enumerate() {
         let Some(&frame) = capture.train.iter().find(|&&i| capture.frames[i].camera == rig) else { continue };
         let path = folder.join(format!("calm/{}.png", camera.name));
-        let picture = image::open(&path).map_err(|e| {
-            Error::input(format!("it cannot be read: {e}")).at(path.display()).remedy("Delete the folder")
-        })?;
+        let picture = Rgb8::read(&path).map_err(|e| e.remedy("Delete the folder"))?;
         let camera = &capture.frames[frame].view;
-        views.push((camera.clone(), picture.into_luma8().into_raw()));
+        views.push((camera.clone(), picture.data.into_iter().step_by(3).collect()));
     }
     for layer in &mut scene.layers {
         let stays: Vec<bool> = layer.means().map(|mean| is_calm(mean, &views)).collect();
