@@ -21,7 +21,7 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::draw::{Channel, Painter, Transfer, antialias};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::localising::{LocaliseOptions, localise};
 use splat4d_workflow::meshing::{self, MeshOptions};
 use splat4d_workflow::paths::{Route, View};
@@ -384,12 +384,13 @@ impl Scene {
             }
             (Some("html"), None) => exporting::page(file, &path, None, listener),
             (Some("ply"), _) => {
-                let source = Source::open(file)?;
+                let mut source = Source::open(file)?;
                 source.keep(file, &path, &[])?;
+                not_empty(&source.scene, file)?;
+                exporting::fold(&mut source, listener)?;
                 let scene = &source.scene;
-                not_empty(scene, file)?;
                 let t = t.unwrap_or(scene.clip[0]);
-                let count = exporting::moment(scene, t, false, &path)?;
+                let count = exporting::moment(scene, t, PlyOptions::default(), &path)?;
                 exporting::warn_of_empty(scene, t, count, listener);
                 Ok(())
             }
@@ -418,8 +419,16 @@ impl Scene {
         let mut count = 0;
         let work = |file: &Path, _: &Path| {
             listening(|listener| {
-                let source = exporting::open(file, None)?;
-                count = exporting::frames(file, &source, &folder, &frames, [world, force], listener)?;
+                let mut source = exporting::open(file, None)?;
+                exporting::fold(&mut source, listener)?;
+                count = exporting::frames(
+                    file,
+                    &source,
+                    &folder,
+                    &frames,
+                    (PlyOptions { world, velocities: false }, force),
+                    listener,
+                )?;
                 Ok(())
             })
         };

@@ -39,6 +39,7 @@
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `activity.rs` | which Gaussians of a scene are active when |
+//! | `folding.rs` | colours that a network makes, as spherical harmonics |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
@@ -79,6 +80,7 @@ pub mod evaluating;
 pub mod events;
 pub mod exporting;
 pub mod files;
+pub mod folding;
 pub mod foreign;
 pub mod growing;
 #[cfg(feature = "import")]

@@ -126,6 +126,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "point_queries",
             "measure",
             "activity",
+            "folding",
             "baking",
             "playable",
             "growing",

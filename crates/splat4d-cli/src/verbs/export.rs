@@ -7,7 +7,7 @@ use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use splat4d::Error;
 use splat4d_workflow::converting::{self, Conversion};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::files;
 use splat4d_workflow::meshing::{self, MeshOptions};
 use splat4d_workflow::programs::{PROGRAMS, Program};
@@ -23,6 +23,8 @@ Examples:
   splat4d export runs/knight --html -o index.html --link knight.s4d    for a web server
   splat4d export runs/knight --tracks tracks.csv           positions at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
+  splat4d export runs/knight --tracks flow.npz             scene flow: positions and velocities
+  splat4d export runs/knight --sequence frames/ --velocities
   splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
   splat4d export runs/knight --tracks paths.csv --points asked.csv    given points
   splat4d export runs/knight -o knight.ply --time 0.5 --label knight
@@ -65,7 +67,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     to: Option<f64>,
 
-    /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file
+    /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file, or with velocities to this
+    /// .npz
     #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "sequence", "time", "html"])]
     tracks: Option<PathBuf>,
     /// Track these points and their visibility instead of Gaussians
@@ -77,6 +80,9 @@ pub(crate) struct Args {
     /// Add the scene's offset: positions in the capture's world, in double precision (.ply, tracks of Gaussians)
     #[arg(long, conflicts_with_all = ["html", "points"])]
     world: bool,
+    /// Add velocities to every Gaussian of a .ply: vx, vy, vz, scene units per second
+    #[arg(long, conflicts_with_all = ["html", "tracks", "program"])]
+    velocities: bool,
     /// Only every N-th Gaussian's track
     #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
           value_parser = clap::value_parser!(u32).range(1..))]
@@ -161,7 +167,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.link.is_some() {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
-    let source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
+    let mut source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
     if let Some(out) = &args.mesh {
         let frames = Frames { fps: args.fps, from: args.from, to: args.to };
         let options = MeshOptions {
@@ -177,6 +183,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let outputs: Vec<&Path> = args.output.iter().chain(&args.tracks).map(PathBuf::as_path).collect();
     source.keep_all(path, &outputs, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
+    if args.tracks.is_none() && args.program.is_none() {
+        exporting::fold(&mut source, console)?;
+    }
     let scene = &source.scene;
     let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {
@@ -200,8 +209,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let named = folder.join(program.frame);
         return Ok(converting::run(&Conversion { frames: true, ..conversion(&named) }, console)?);
     }
+    let options = PlyOptions { world: args.world, velocities: args.velocities };
     if let Some(folder) = &args.sequence {
-        exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
+        exporting::frames(path, &source, folder, &frames, (options, args.force), console)?;
         return Ok(());
     }
     let out = args.output.as_ref().expect("clap requires an output");
@@ -215,7 +225,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if program.is_some() {
         return Ok(converting::run(&Conversion { time: Some(time), ..conversion(out) }, console)?);
     }
-    let n = exporting::moment(scene, time, args.world, out)?;
+    let n = exporting::moment(scene, time, options, out)?;
     exporting::warn_of_empty(scene, time, n, console);
     console.print_line(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
