@@ -21,6 +21,7 @@
 //!
 //! `gpu` adds the GPU renderer. `dynamics` (forecasts), `import` (captures from videos, the doctor) and `serve` (the
 //! player's server) are on by default; without one its functions are missing, or return an error that names it.
+//! `storage` adds runs and captures on object storage.
 //!
 //! # Code map
 //!
@@ -50,6 +51,7 @@
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
+//! | `storage/` | captures and runs on object storage |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
@@ -108,6 +110,8 @@ mod sound;
 pub mod source;
 pub mod status;
 pub mod still_baseline;
+#[cfg(any(test, feature = "storage"))]
+pub mod storage;
 pub mod texts;
 pub mod training;
 pub mod video;
