@@ -11,12 +11,10 @@ use crate::math::cholesky::Cholesky;
 use crate::math::sh::{MAX_COEFFS, basis, coeffs, degree_of};
 use crate::math::{Real, se3};
 use crate::motion::spacetime::FEATURE_TABLE;
-use crate::motion::{Spacetime, SpacetimeSpec, Spec};
 use crate::render::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use crate::scene::head::{HEAD_IN, HEAD_OUT};
-use crate::scene::{Camera, Color, Grads, HeadKeys, Params, SH, Splats, Table, Time};
+use crate::scene::{Camera, Color, Grads, HeadKeys, SH, Splats, Table, Time};
 use crate::{Error, Result};
-use std::sync::Arc;
 
 /// Passes over the images. Six more gain less than 0.1 dB (studies/records/2026-11-28-pixel-head.md).
 const PASSES: usize = 10;
@@ -29,8 +27,8 @@ const FLOOR: f64 = 1e-6;
 /// The scene without its head, its colours as spherical harmonics of at least `degree` that look alike from these cameras at
 /// these times (seconds). Colours that change with time keep their mean. A scene without a head is returned unchanged.
 ///
-/// `progress` gets the finished and the total number of renders. Errors: no image; a model around the features that is
-/// not `spacetime`.
+/// `progress` gets the finished and the total number of renders. Errors: no image; a model around the features that cannot
+/// be without them.
 pub fn fold_head(
     scene: &Scene<f32>,
     shots: &[(f64, Camera)],
@@ -79,14 +77,9 @@ pub fn fold_head(
 fn without_features(scene: &Scene<f32>, degree: usize) -> Result<Scene<f32>> {
     let mut out = Scene { head: Head::Identity, ..scene.clone() };
     for layer in &mut out.layers {
-        if let Spec::Spacetime(spec) = layer.motion.spec()
-            && spec.features.is_some()
-        {
-            let plain = SpacetimeSpec { features: None, ..spec };
-            // The model's own tables come first, features after them: the keys stay the same.
-            let motion = Spacetime::new(plain, &mut Params::<f32>::new(0, 1, layer.life.columns()))?;
+        if let Some(motion) = layer.motion.without_features() {
             layer.params = layer.params.without(&[FEATURE_TABLE, HEAD_IN, HEAD_OUT]);
-            layer.motion = Arc::new(motion);
+            layer.motion = motion;
         }
         if HeadKeys::of(&layer.params).is_some() {
             scene.without_head("spherical harmonics")?;
@@ -204,10 +197,10 @@ mod tests {
     use crate::device;
     use crate::layers::Layer;
     use crate::math::{Rng, Se3};
-    use crate::motion::build;
     use crate::motion::spacetime::FeatureSpec;
+    use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
-    use crate::scene::{GEOMETRY, LifeKind};
+    use crate::scene::{GEOMETRY, LifeKind, Params};
 
     /// A ball of Gaussians whose head reddens what is seen along x.
     fn headed() -> Scene<f32> {
