@@ -32,6 +32,13 @@ pub enum Loudness {
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 /// Time between two objects of one phase, with `--json`.
 const JSON_INTERVAL: Duration = Duration::from_secs(1);
+/// Columns of a report's headings.
+const HEADING: usize = 16;
+/// Renditions of ECMA-48.
+const BOLD: u8 = 1;
+const RED: u8 = 31;
+const GREEN: u8 = 32;
+const YELLOW: u8 = 33;
 /// A shorter phase shows no time left.
 const LEAST_PACE: Duration = Duration::from_secs(3);
 
@@ -130,13 +137,11 @@ impl Console {
         self.above_bar(|| print(text));
     }
 
-    /// The same for a health report: its lines of problems (`! …`) and its last line, the verdict, have colours on a
-    /// terminal.
+    /// The same for a health report: its headings, its lines of problems (`! …`) and its last line, the verdict, have
+    /// colours on a terminal.
     pub(crate) fn report(&self, text: &str, healthy: bool) {
         let text = text::shown(text);
-        let colours = std::io::stdout().is_terminal()
-            && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
-            && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
+        let colours = has_colours(&std::io::stdout());
         self.above_bar(|| print_shown(&if colours { painted(&text, healthy) } else { text.into_owned() }));
     }
 
@@ -172,7 +177,7 @@ impl Console {
         if self.json {
             self.emit(&json!({"type": "warning", "message": message}));
         } else {
-            self.above_bar(|| eprint_line(&format!("warning: {}", text::in_line(message))));
+            self.above_bar(|| eprint_labelled("warning:", YELLOW, &text::in_line(message)));
         }
     }
 
@@ -193,7 +198,7 @@ impl Console {
         self.clear();
         let paragraph = flags(&linked(&message.split_whitespace().collect::<Vec<_>>().join(" ")));
         let end = if paragraph.ends_with(['.', '?', '!']) { "" } else { "." };
-        eprint_line(&format!("error: {paragraph}{end}"));
+        eprint_labelled("error:", RED, &format!("{paragraph}{end}"));
         self.emit(&json!({"type": "error", "message": paragraph, "code": code}));
     }
 
@@ -395,16 +400,36 @@ fn one_json_line(value: &Value) -> String {
     line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
 }
 
-/// A report in colours of ECMA-48: lines of problems yellow, the verdict green or red.
+/// Whether a stream shows colours: a terminal that is not dumb, and the user does not refuse them (https://no-color.org).
+fn has_colours(stream: &impl IsTerminal) -> bool {
+    stream.is_terminal()
+        && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+        && std::env::var_os("TERM").is_none_or(|t| t != "dumb")
+}
+
+/// Text in a rendition of ECMA-48.
+fn paint(text: &str, rendition: u8) -> String {
+    format!("\x1b[{rendition}m{text}\x1b[0m")
+}
+
+/// A report in colours: headings bold, lines of problems yellow, the verdict green or red.
 fn painted(report: &str, healthy: bool) -> String {
-    let paint = |line: &str, colour: u8| format!("\x1b[{colour}m{line}\x1b[0m");
-    let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { 32 } else { 31 });
+    let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { GREEN } else { RED });
     let above = report.lines().count().saturating_sub(1);
-    let body = report.lines().take(above).map(|line| match line.trim_start().starts_with("! ") {
-        true => paint(line, 33) + "\n",
-        false => format!("{line}\n"),
-    });
+    let line = |line: &str| match heading(line) {
+        _ if line.trim_start().starts_with("! ") => paint(line, YELLOW),
+        Some((name, rest)) => paint(name, BOLD) + rest,
+        None => line.to_owned(),
+    };
+    let body = report.lines().take(above).map(|text| line(text) + "\n");
     body.collect::<String>() + &verdict
+}
+
+/// The heading of a line of a report, which fills a column, and the rest.
+fn heading(line: &str) -> Option<(&str, &str)> {
+    let (column, rest) = line.split_at_checked(HEADING)?;
+    let name = column.trim_end();
+    (rest.starts_with(' ') && !name.is_empty() && !line.starts_with(' ')).then(|| line.split_at(name.len()))
 }
 
 /// Prints a line on stdout, safe for a terminal.
@@ -431,6 +456,13 @@ fn print_shown(line: &str) {
 /// Prints a line on stderr, safe for a terminal; nothing happens if that is closed.
 pub(crate) fn eprint_line(line: &str) {
     let _ = writeln!(std::io::stderr().lock(), "{}", text::shown(&stamped(line)));
+}
+
+/// The same with a label, which has a colour on a terminal.
+fn eprint_labelled(label: &str, colour: u8, text: &str) {
+    let line = text::shown(text);
+    let label = if has_colours(&std::io::stderr()) { paint(label, colour) } else { label.to_owned() };
+    let _ = writeln!(std::io::stderr().lock(), "{}", stamped(&format!("{label} {line}")));
 }
 
 /// Whether lines begin with the time.
@@ -473,14 +505,18 @@ mod tests {
     }
 
     #[test]
-    fn problems_and_verdict_are_coloured() {
-        let text = "cameras          3\n  ! one is dark\n! no points\ndoes not look healthy";
-        let painted = painted(text, false);
-        assert_eq!(
-            painted,
-            "cameras          3\n\x1b[33m  ! one is dark\x1b[0m\n\x1b[33m! no points\x1b[0m\n\x1b[31mdoes not look healthy\x1b[0m"
-        );
-        assert_eq!(super::painted("looks healthy", true), "\x1b[32mlooks healthy\x1b[0m");
+    fn headings_problems_and_verdict_are_coloured() {
+        let text = "cameras          3\nheld-out scores  PSNR\n  ! one is dark\n                 ###\n! no points\ndoes not look healthy";
+        let lines = [
+            "\x1b[1mcameras\x1b[0m          3",
+            "\x1b[1mheld-out scores\x1b[0m  PSNR",
+            "\x1b[33m  ! one is dark\x1b[0m",
+            "                 ###",
+            "\x1b[33m! no points\x1b[0m",
+            "\x1b[31mdoes not look healthy\x1b[0m",
+        ];
+        assert_eq!(painted(text, false), lines.join("\n"));
+        assert_eq!(painted("looks healthy", true), "\x1b[32mlooks healthy\x1b[0m");
     }
 
     #[test]

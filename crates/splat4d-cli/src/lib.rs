@@ -11,7 +11,7 @@
 //! | module | content |
 //! |---|---|
 //! | `interrupt.rs`, `bar.rs`, `console.rs` | Ctrl-C; a progress bar; output |
-//! | `device.rs`, `measuring.rs`, `serving.rs` | options of several commands: device, evaluation, the player's server |
+//! | `device.rs`, `measuring.rs`, `serving.rs`, `storage.rs` | options of several commands: device, evaluation, the player's server, object storage |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
 
@@ -23,6 +23,7 @@ mod device;
 pub mod interrupt;
 mod measuring;
 mod serving;
+mod storage;
 pub mod verbs;
 
 use clap::{Parser, Subcommand};

@@ -59,12 +59,12 @@ pub fn in_words(outlook: &ChunkEstimate) -> String {
     words
 }
 
-/// Does the requested work on a capture, and appends what is finished to its playback file, within the options'
-/// minutes. `None`: nothing was to do.
+/// Does the requested work on a capture, and, if `grow`, appends what is finished to its playback file, within the
+/// options' minutes. `None`: nothing was to do.
 pub fn work(
     run: &Path,
     chunked: &Chunked,
-    wanted: ChunkSelection,
+    (wanted, grow): (ChunkSelection, bool),
     options: &TrainOptions,
     stop: &AtomicBool,
     console: &dyn Listener,
@@ -73,7 +73,7 @@ pub fn work(
     let deadline = Deadline::of(options.clock.clone(), options.minutes);
     // Its errors never fail a chunk, and are corrected at the join.
     let append = || {
-        if let Err(e) = growing::append(run, chunked, &baking(chunked, &deadline), stop, console) {
+        if grow && let Err(e) = growing::append(run, chunked, &baking(chunked, &deadline), stop, console) {
             console.warn(&format!("the playback file does not grow: {e}"));
         }
     };

@@ -372,7 +372,9 @@ fn of_run(path: &Path) -> Result<Inspection> {
     line(&mut text, "run", &run.name());
     if let Some(capture) = run.capture() {
         line(&mut text, "capture", &capture.display().to_string());
-        if !capture.exists() {
+        // On object storage.
+        let is_elsewhere = capture.to_str().is_some_and(|text| text.contains("://"));
+        if !is_elsewhere && !capture.exists() {
             troubles.push(
                 "The capture is not there any more: the run can be rendered, but neither resumed nor measured.".into(),
             );
@@ -622,5 +624,24 @@ fn histogram(out: &mut String, name: &str, edges: &[f64], counts: &[usize], labe
         let bar = "#".repeat((count * BAR).div_ceil(most));
         let first = if i == 0 { name } else { "" };
         let _ = writeln!(out, "{first:<16} {:<18} {:>10} {bar}", label(&edges[i..i + 2]), grouped(*count));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scores_of_a_run_are_in_the_order_of_their_use() {
+        let run = tempfile::tempdir().unwrap();
+        std::fs::write(run.path().join("recipe.toml"), Recipe::default().to_toml()).unwrap();
+        let scores = json!({
+            "D-SSIM": 0.1, "LPIPS-alex": 0.2, "PSNR": 25.125, "PSNR-dynamic": 20.5, "SSIM": 0.9, "flicker": 0.25,
+        });
+        std::fs::write(run.path().join("results.json"), json!({"ours_20": scores}).to_string()).unwrap();
+        let text = inspect(run.path(), &InspectOptions::default(), &crate::events::ignore).unwrap().text;
+        let line = text.lines().find_map(|l| l.strip_prefix("held-out scores  ")).unwrap();
+        let words = "PSNR 25.12 dB, dynamic regions 20.50 dB, SSIM 0.9000, LPIPS (AlexNet) 0.2000, flicker 0.250/255";
+        assert_eq!(line, words);
     }
 }

@@ -21,6 +21,7 @@
 //!
 //! `gpu` adds the GPU renderer. `dynamics` (forecasts), `import` (captures from videos, the doctor) and `serve` (the
 //! player's server) are on by default; without one its functions are missing, or return an error that names it.
+//! `storage` adds runs and captures on object storage.
 //!
 //! # Code map
 //!
@@ -43,12 +44,14 @@
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
+//! | `meshing.rs`, `meshing/` | surfaces over time as triangle meshes |
 //! | `localising.rs` | pose and time of images |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `adopting.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; a scene of another program as a run; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
+//! | `storage/` | captures and runs on object storage |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
@@ -88,6 +91,7 @@ pub mod inspecting;
 pub mod labelling;
 pub mod localising;
 pub mod measure;
+pub mod meshing;
 pub mod parts;
 pub mod paths;
 mod picking;
@@ -106,6 +110,8 @@ mod sound;
 pub mod source;
 pub mod status;
 pub mod still_baseline;
+#[cfg(any(test, feature = "storage"))]
+pub mod storage;
 pub mod texts;
 pub mod training;
 pub mod video;

@@ -8,6 +8,8 @@ use splat4d::text::in_line;
 use splat4d_train::output::Owner;
 use splat4d_train::path_text::in_command;
 use splat4d_train::run::chunks::{Chunked, Part};
+#[cfg(any(test, feature = "storage"))]
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -70,8 +72,23 @@ pub struct Status {
 
 /// Reads how far a run is. Errors: it is not a run, or damaged.
 pub fn of(path: &Path) -> Result<Status> {
+    named(path, path, &|_| None)
+}
+
+/// The same of a copy of a run, whose own path is `name`. `workers`: of parts, by their names.
+#[cfg(any(test, feature = "storage"))]
+pub(crate) fn of_copy(path: &Path, name: &Path, workers: &BTreeMap<String, String>) -> Result<Status> {
+    named(path, name, &|part| workers.get(part).cloned())
+}
+
+fn named(path: &Path, own: &Path, worker: &dyn Fn(&str) -> Option<String>) -> Result<Status> {
     let run = Run::open(path)?;
     let mut parts = if Chunked::is(path) { of_chunks(&Chunked::open(path)?) } else { vec![whole(path, &run)] };
+    for part in parts.iter_mut().filter(|p| p.state != State::Done) {
+        if let Some(worker) = worker(&part.part) {
+            (part.state, part.worker) = (State::Training, Some(worker));
+        }
+    }
     // A step takes as long as in the parts of which that is known.
     let known =
         |f: fn(&PartStatus) -> Option<f64>| parts.iter().filter(|p| pace(p).is_some()).filter_map(f).sum::<f64>();
@@ -91,16 +108,18 @@ pub fn of(path: &Path) -> Result<Status> {
     let left: Option<f64> = parts.iter().map(|p| p.seconds_left).sum();
     let failures = parts.iter().filter(|p| p.state == State::Stopped).map(PartStatus::failure).collect();
     let (finished, chunked) = (Run::is_finished(path), Chunked::is(path));
-    let name = in_command(path);
+    let name = in_command(own);
     let next = match () {
         () if finished => Some(format!("splat4d view {name}")),
         () if parts.iter().any(|p| p.state == State::Training) => None,
         () if chunked && done == total => Some(format!("splat4d join {name}")),
+        // Workers on a storage repeat their command.
+        () if own != path => None,
         () => Some(format!("splat4d train --resume {name}")),
     };
     Ok(Status {
         kind: "status",
-        run: path.to_string_lossy().into_owned(),
+        run: own.to_string_lossy().into_owned(),
         finished,
         chunked,
         done,

@@ -62,6 +62,8 @@ pub struct TrainingOptions {
     pub predict: bool,
     /// Train one part of a long capture and end; none: all parts, which are joined.
     pub chunk: Option<ChunkSelection>,
+    /// Append finished parts of a long capture to the run's playback file.
+    pub grow: bool,
     /// Device to train on.
     pub device: Device,
     /// Options of the evaluation.
@@ -85,6 +87,7 @@ impl Default for TrainingOptions {
             minutes: None,
             predict: false,
             chunk: None,
+            grow: true,
             device: Device::Cpu,
             measure: Measure::default(),
             finish: Finish::default(),
@@ -366,9 +369,10 @@ impl<'a> Work<'a> {
         let training = self.options(options.minutes, 0.0, false);
         let wanted = options.chunk.unwrap_or(ChunkSelection::All);
         listener.stop_polled(SAVING);
-        let outcome = chunked::work(run, chunked, wanted, &training, self.stop, listener, &mut |event| {
-            listener.event(event);
-        });
+        let outcome =
+            chunked::work(run, chunked, (wanted, options.grow), &training, self.stop, listener, &mut |event| {
+                listener.event(event);
+            });
         listener.clear();
         let interrupted = outcome?.is_some_and(|o| o.interrupted);
         let trained = Trained { run: run.to_owned(), iteration: None, interrupted };

@@ -133,6 +133,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "programs",
             "converting",
             "exporting",
+            "meshing",
             "localising",
             "comparing",
             "report",
@@ -147,6 +148,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "training",
             "importing",
             "inspecting",
+            "storage",
             "predicting",
             "editing",
             "picking",
@@ -156,7 +158,10 @@ const ORDER: [(&str, &[&str]); 9] = [
             "texts",
         ],
     ),
-    ("crates/splat4d-cli", &["interrupt", "bar", "console", "device", "measuring", "serving", "verbs", "main", "bin"]),
+    (
+        "crates/splat4d-cli",
+        &["interrupt", "bar", "console", "device", "measuring", "serving", "storage", "verbs", "main", "bin"],
+    ),
     (
         "crates/splat4d-py",
         &[

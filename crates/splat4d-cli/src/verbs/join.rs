@@ -3,6 +3,7 @@
 use crate::console::Console;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
+use crate::storage::{self, StorageArgs};
 use splat4d_train::output::OutputFolder;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_workflow::chunked;
@@ -26,15 +27,34 @@ pub(crate) struct Args {
     no_eval: bool,
     #[command(flatten)]
     measure: MeasureArgs,
+    #[command(flatten)]
+    storage: StorageArgs,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     let stop = interrupt::flag("stopping");
     interrupt::stop_not_polled("all parts are kept, and the same command joins them");
+    if storage::is_address(&args.run) {
+        return on_storage(args, &stop, console);
+    }
     let chunked = Chunked::open(&args.run)?;
     let _folder = OutputFolder::amend(&args.run, "join")?;
     chunked::join(&args.run, &chunked, args.no_eval, &args.measure.options(), &Deadline::default(), &stop, console)?;
     console.next("view", &args.run);
     Ok(())
+}
+
+#[cfg(feature = "storage")]
+fn on_storage(args: &Args, stop: &std::sync::atomic::AtomicBool, console: &Console) -> anyhow::Result<()> {
+    let storage = args.storage.open();
+    splat4d_workflow::storage::join(&args.run, args.no_eval, &args.measure.options(), &storage, stop, console)?;
+    console.next("status", &args.run);
+    Ok(())
+}
+
+#[cfg(not(feature = "storage"))]
+fn on_storage(args: &Args, _: &std::sync::atomic::AtomicBool, _: &Console) -> anyhow::Result<()> {
+    let Args { storage: _, .. } = args;
+    storage::refused()
 }

@@ -5,6 +5,7 @@ use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
 use crate::serving::{self, Control, Place, Watched};
+use crate::storage::{self, StorageArgs};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_train::path_text::in_command;
@@ -13,8 +14,9 @@ use splat4d_train::settings::{Setting, nearest};
 use splat4d_workflow::chunked::ChunkSelection;
 use splat4d_workflow::files::{self, parse_bytes};
 use splat4d_workflow::parts::left_out;
-use splat4d_workflow::training::{self, Finish, TrainingOptions};
-use std::path::PathBuf;
+use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// Owner named by a run's lock while it is continued.
 const RESUME: &str = "train --resume";
@@ -140,6 +142,8 @@ pub struct Args {
     view: bool,
     #[command(flatten)]
     place: Place,
+    #[command(flatten)]
+    storage: StorageArgs,
     /// Only train and bake; skip evaluation, film and report
     #[arg(long, help_heading = "Evaluation")]
     no_eval: bool,
@@ -191,20 +195,37 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         clock: control.clock(),
         ..TrainingOptions::default()
     };
+    let source = args.capture.as_ref().or(args.source.as_ref());
+    let paths = [source, args.output.as_ref(), args.resume.as_ref()];
+    let on_storage = paths.into_iter().flatten().any(|path| storage::is_address(path));
     let trained = match &args.resume {
+        Some(_) if on_storage => {
+            return Err(Error::input("--resume needs a local run")
+                .remedy("On object storage run the command that began the run again: it continues")
+                .into());
+        }
         Some(run) => {
             let options = TrainingOptions { command: RESUME, ..options };
             training::resume(run, &options, &stop, &watched)?
         }
         None => {
-            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap requires a capture");
+            let source = source.expect("clap requires a capture");
             let recipe = recipe(args)?;
             let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
             recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
-            training::train(source, &recipe, &options, &stop, &watched)?
+            if on_storage {
+                train_on_storage(args, source, &recipe, &options, &stop, &watched)?
+            } else {
+                training::train(source, &recipe, &options, &stop, &watched)?
+            }
         }
     };
     let run = &trained.run;
+    if trained.interrupted && storage::is_address(run) {
+        return Err(Error::new(ErrorKind::Interrupted, "training was stopped, and its checkpoint is uploaded")
+            .remedy("Run the same command again to continue")
+            .into());
+    }
     if trained.interrupted {
         let resume = format!("splat4d train --resume {}", in_command(run));
         watched.stopped(trained.iteration.unwrap_or(0), &resume);
@@ -226,6 +247,30 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         serving::wait(&stop);
     }
     Ok(())
+}
+
+#[cfg(feature = "storage")]
+fn train_on_storage(
+    args: &Args,
+    source: &Path,
+    recipe: &Recipe,
+    options: &TrainingOptions,
+    stop: &AtomicBool,
+    watched: &Watched<'_>,
+) -> anyhow::Result<Trained> {
+    Ok(splat4d_workflow::storage::train(source, recipe, options, &args.storage.open(), stop, watched)?)
+}
+
+#[cfg(not(feature = "storage"))]
+fn train_on_storage(
+    Args { storage: _, .. }: &Args,
+    _: &Path,
+    _: &Recipe,
+    _: &TrainingOptions,
+    _: &AtomicBool,
+    _: &Watched<'_>,
+) -> anyhow::Result<Trained> {
+    storage::refused()
 }
 
 /// The recipe file, then the quality, then the options, then every --set.

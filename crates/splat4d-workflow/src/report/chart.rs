@@ -13,8 +13,11 @@ const BOTTOM: f64 = 40.0;
 const MAX_POINTS: usize = 260;
 /// Points that get a tooltip.
 const MAX_TIPS: usize = 48;
-/// Colours that the style sheet defines (`--c0` …).
-const COLORS: usize = 6;
+/// Colours that the style sheet defines (`--c0` …). Any two differ by at least 0.12 in OKLab, also as people without one
+/// kind of cone see them (Machado et al. 2009); each has a contrast of 3 with the page.
+const COLORS: usize = 8;
+/// From the ninth curve on colours repeat with dashes: lengths of dashes and gaps, pixels.
+const DASHES: [&[f64]; 4] = [&[], &[7.0, 4.0], &[2.0, 3.0], &[9.0, 3.0, 2.0, 3.0]];
 
 type Points = Vec<(f64, f64)>;
 
@@ -26,15 +29,27 @@ pub struct Series {
     pub points: Points,
 }
 
-/// Dashes of a curve: from the seventh on, colours repeat with dashes.
-fn dashes(i: usize) -> &'static str {
-    if i < COLORS { "" } else { ";stroke-dasharray:6 4" }
+fn pattern(i: usize) -> &'static [f64] {
+    DASHES[i / COLORS % DASHES.len()]
+}
+
+/// Dashes of a curve, as a style.
+fn dashes(i: usize) -> String {
+    let lengths: Vec<String> = pattern(i).iter().map(f64::to_string).collect();
+    if lengths.is_empty() { String::new() } else { format!(";stroke-dasharray:{}", lengths.join(" ")) }
 }
 
 /// A curve's mark in the legend.
 fn mark(i: usize) -> String {
     let color = format!("var(--c{})", i % COLORS);
-    if i < COLORS { color } else { format!("repeating-linear-gradient(90deg,{color} 0 5px,transparent 5px 8px)") }
+    let mut stops = Vec::new();
+    let mut at = 0.0;
+    for (k, length) in pattern(i).iter().enumerate() {
+        let shown = if k % 2 == 0 { &color } else { "transparent" };
+        stops.push(format!("{shown} {at}px {}px", at + length));
+        at += length;
+    }
+    if stops.is_empty() { color } else { format!("repeating-linear-gradient(90deg,{})", stops.join(",")) }
 }
 
 /// Text that is safe inside HTML and attributes.
@@ -141,10 +156,11 @@ pub fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
 }
 
 /// The colours of the page's style sheet, for images outside the page.
-const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c4:#0f8a80;--c5:#5c6b73;--soft:#6d6a66;\
---line:#e6e2dc;font-family:sans-serif}@media(prefers-color-scheme:dark){svg{--c0:#f08c4e;--c1:#6fb1f2;--c2:#7cc68d;\
---c3:#c69be4;--c4:#5fd0c5;--c5:#9fb0ba;--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}\
-.tick,.axis{fill:var(--soft);font-size:11.5px}.line{fill:none;stroke-width:1.8}";
+const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#009c90;--c3:#b478f0;--c4:#781800;--c5:#e47818;--c6:#9c00fc;--c7:#243c6c;\
+--soft:#6d6a66;--line:#e6e2dc;font-family:sans-serif}@media(prefers-color-scheme:dark){svg{\
+--c0:#f08c4e;--c1:#6fb1f2;--c2:#c0f000;--c3:#6c60fc;--c4:#d83c24;--c5:#fcc0a8;--c6:#00f0fc;--c7:#9c6c9c;\
+--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}.tick,.axis{fill:var(--soft);font-size:11.5px}\
+.line{fill:none;stroke-width:1.8}";
 
 /// Space for a name below the curves of a file; three fit.
 const NAME: f64 = 118.0;
@@ -301,15 +317,80 @@ mod tests {
         assert!(one.contains("<circle") && one.contains("a&lt;b") && !one.contains("NaN"));
         let many = lines(&series((0..100_000).map(|i| (f64::from(i), 1.0)).collect()), "step", "dB").unwrap();
         assert!(many.len() < 40_000, "a long run stays small: {}", many.len());
-        let seven: Vec<Series> =
-            (0..7).map(|i| Series { name: i.to_string(), points: vec![(0.0, f64::from(i))] }).collect();
-        let seven = lines(&seven, "step", "dB").unwrap();
-        assert_eq!(
-            (seven.matches("dasharray").count(), seven.matches("repeating").count()),
-            (1, 1),
-            "the seventh differs"
-        );
         assert!(bars(&[], 0.0, "x").is_none());
         assert!(!bars(&[("cam".into(), 3.0, "3 dB".into())], 3.0, "x").unwrap().contains("NaN"));
+    }
+
+    #[test]
+    fn many_curves_differ_in_colour_or_dashes() {
+        let many = COLORS * DASHES.len();
+        let series: Vec<Series> =
+            (0..many).map(|i| Series { name: i.to_string(), points: vec![(0.0, 1.0), (1.0, i as f64)] }).collect();
+        let svg = lines(&series, "step", "dB").unwrap();
+        let looks = |start: &str| {
+            let found: Vec<&str> = svg.split(start).skip(1).map(|rest| rest.split('"').next().unwrap()).collect();
+            assert_eq!(found.len(), many, "{start}");
+            found.into_iter().collect::<std::collections::BTreeSet<_>>().len()
+        };
+        assert_eq!(looks(r#"class="line" style=""#), many, "no two curves look the same");
+        assert_eq!(looks(r#"<i style="background:"#), many, "nor do two marks of the legend");
+    }
+
+    /// Colours of a style sheet, sRGB: those on a light page, then those on a dark one.
+    fn palettes(sheet: &str) -> [Vec<[f64; 3]>; 2] {
+        let mut found = sheet.split("--c").skip(1).map(|rest| {
+            let hex = rest.split('#').nth(1).unwrap();
+            [0, 2, 4].map(|k| f64::from(u8::from_str_radix(&hex[k..k + 2], 16).unwrap()) / 255.0)
+        });
+        let light: Vec<_> = found.by_ref().take(COLORS).collect();
+        let dark: Vec<_> = found.by_ref().take(COLORS).collect();
+        assert!(dark.len() == COLORS && found.next().is_none());
+        [light, dark]
+    }
+
+    #[test]
+    fn colours_differ_for_the_colour_blind_too() {
+        type Matrix = [[f64; 3]; 3];
+        // Machado, Oliveira, Fernandes 2009, severity 1.
+        const SIGHT: [Matrix; 4] = [
+            [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+            [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+            [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+        ];
+        // OKLab: Ottosson 2020.
+        const CONES: Matrix = [
+            [0.4122214708, 0.5363325363, 0.0514459929],
+            [0.2119034982, 0.6806995451, 0.1073969566],
+            [0.0883024619, 0.2817188376, 0.6299787005],
+        ];
+        const LAB: Matrix = [
+            [0.2104542553, 0.7936177850, -0.0040720468],
+            [1.9779984951, -2.4285922050, 0.4505937099],
+            [0.0259040371, 0.7827717662, -0.8086757660],
+        ];
+        let times = |m: &Matrix, v: [f64; 3]| m.map(|row| (0..3).map(|k| row[k] * v[k]).sum::<f64>());
+        let linear = |c: f64| if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
+        let luminance = |c: [f64; 3]| 0.2126 * linear(c[0]) + 0.7152 * linear(c[1]) + 0.0722 * linear(c[2]);
+        let (page, file) = (palettes(include_str!("style.css")), palettes(STYLE));
+        assert_eq!(page, file, "images outside the page have its colours");
+        for (colors, card) in page.into_iter().zip([[1.0; 3], [32.0 / 255.0, 31.0 / 255.0, 29.0 / 255.0]]) {
+            for (i, a) in colors.iter().enumerate() {
+                let (a_light, b_light) = (luminance(*a) + 0.05, luminance(card) + 0.05);
+                let contrast = a_light.max(b_light) / a_light.min(b_light);
+                assert!(contrast >= 3.0, "colour {i}: {contrast:.2}");
+                for (j, b) in colors.iter().enumerate().take(i) {
+                    for sight in &SIGHT {
+                        let lab = |c: [f64; 3]| {
+                            let seen = times(sight, c.map(linear)).map(|v| v.clamp(0.0, 1.0));
+                            times(&LAB, times(&CONES, seen).map(f64::cbrt))
+                        };
+                        let (a, b) = (lab(*a), lab(*b));
+                        let apart = (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
+                        assert!(apart >= 0.12, "colours {i} and {j}: {apart:.3}");
+                    }
+                }
+            }
+        }
     }
 }

@@ -1,11 +1,12 @@
 //! `info`: what a capture, a run or a file contains, and whether it looks healthy.
 
 use crate::console::Console;
+use crate::storage::{self, StorageArgs};
 use serde_json::json;
 use splat4d::Error;
 use splat4d::text::in_line;
 use splat4d_train::recipe::Recipe;
-use splat4d_workflow::inspecting::{Conformance, InspectOptions, conformance, inspect};
+use splat4d_workflow::inspecting::{Conformance, InspectOptions, Inspection, conformance, inspect};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -51,6 +52,8 @@ pub(crate) struct Args {
     /// Folder of --doctor's output
     #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
     output: PathBuf,
+    #[command(flatten)]
+    storage: StorageArgs,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
@@ -58,7 +61,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return strict(&args.path, console);
     }
     let options = InspectOptions { recipe: recipe(args)?, doctor: args.doctor.then(|| args.output.clone()) };
-    let mut found = inspect(&args.path, &options, console)?;
+    let mut found = read(args, &options, console)?;
     let healthy = found.is_healthy();
     if console.json() {
         found.troubles.append(&mut found.listed);
@@ -77,6 +80,20 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     console.report(&format!("{}{verdict}", found.text), healthy);
     args.verdict(healthy)
+}
+
+#[cfg(feature = "storage")]
+fn read(args: &Args, options: &InspectOptions, console: &Console) -> anyhow::Result<Inspection> {
+    if storage::is_address(&args.path) {
+        return Ok(splat4d_workflow::storage::info(&args.path, options, &args.storage.open(), console)?);
+    }
+    Ok(inspect(&args.path, options, console)?)
+}
+
+#[cfg(not(feature = "storage"))]
+fn read(args: &Args, options: &InspectOptions, console: &Console) -> anyhow::Result<Inspection> {
+    let Args { path, storage: _, .. } = args;
+    if storage::is_address(path) { storage::refused() } else { Ok(inspect(path, options, console)?) }
 }
 
 /// Prints how a playback file deviates from its specification.
