@@ -16,8 +16,8 @@ use crate::scene::head::{HEAD_IN, HEAD_OUT};
 use crate::scene::{Camera, Color, Grads, HeadKeys, SH, Splats, Table, Time};
 use crate::{Error, Result};
 
-/// Passes over the images. Six more gain less than 0.1 dB (studies/records/2026-11-28-pixel-head.md).
-const PASSES: usize = 10;
+/// Passes over the images (studies/records/2026-11-28-pixel-head.md).
+const PASSES: usize = 5;
 /// Weight of small coefficients above degree 0, share of a Gaussian's weight in the images: directions that no image shows are
 /// then not invented.
 const RIDGE: f64 = 0.003;
@@ -46,14 +46,18 @@ pub fn fold_head(
     let mut renderer = Renderer::<f32>::new(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut with_head, mut own) = (Evaluation::default(), Evaluation::default());
     let (mut truth, mut image, mut pixels) = (Image::default(), Image::default(), RenderGrads::default());
+    let mut truths: Vec<Vec<f32>> = Vec::with_capacity(shots.len());
     let mut fits: Vec<Fit> = plain.layers.iter().map(|l| Fit::new(&l.params[SH])).collect();
     let mut shares = Vec::new();
     for pass in 0..PASSES {
         let mut d: Vec<Grads<f32>> = plain.layers.iter().map(|l| Grads::new(&l.params)).collect();
         for (i, (time, camera)) in shots.iter().enumerate() {
             progress(pass * shots.len() + i, PASSES * shots.len());
-            scene.at(Time(*time), &mut with_head);
-            renderer.render(&Shot::new(&scene.splats(&with_head), camera, scene.background), &mut truth);
+            if pass == 0 {
+                scene.at(Time(*time), &mut with_head);
+                renderer.render(&Shot::new(&scene.splats(&with_head), camera, scene.background), &mut truth);
+                truths.push(truth.color.data.iter().map(|t| t.clamp(0.0, 1.0)).collect());
+            }
             plain.at(Time(*time), &mut own);
             let splats = plain.splats(&own);
             let shot = Shot::new(&splats, camera, plain.background);
@@ -62,7 +66,7 @@ pub fn fold_head(
                 renderer.last_contributions(&mut shares);
                 add_normals(&mut fits, &splats, camera, &shares);
             }
-            image.color.data.iter_mut().zip(&truth.color.data).for_each(|(x, t)| *x -= t.clamp(0.0, 1.0));
+            image.color.data.iter_mut().zip(&truths[i]).for_each(|(x, t)| *x -= t);
             let grads = ImageGrads { color: &image.color, alpha: None, depth: None, extra: None };
             renderer.backward(&shot, &grads, &mut sh_grads(&splats, &mut d), &mut pixels);
         }
