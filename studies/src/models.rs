@@ -222,7 +222,7 @@ fn markdown(cells: &[Cell], args: &Args) -> String {
         "Trained for {} minutes a cell on images reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
          difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out \
          views, `moving` is PSNR of dynamic regions. `scene` is the learnt state in 32-bit floats, `file` the \
-         playback file. Frames a second: the learnt state and the playback file, in turns, end to end, 800x800.\n",
+         playback file. Frames a second: the learnt state and the playback file, image by image alternately, end to end, 800x800.\n",
         args.minutes, args.downscale
     );
     let mut captures: Vec<&str> = Vec::new();

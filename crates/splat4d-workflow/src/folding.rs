@@ -13,8 +13,8 @@ use splat4d::scene::Camera;
 
 /// Degree of the spherical harmonics (studies/records/2026-11-28-pixel-head.md).
 const DEGREE: usize = 3;
-/// Training views that colours are fitted to, and the longer side of their renders, pixels.
-const VIEWS: usize = 240;
+/// Training views that colours are fitted to, unless there are more times, and the longer side of their renders, pixels.
+const VIEWS: usize = 64;
 const SIDE: usize = 320;
 /// Views that the result is compared in: held-out ones, where there are some.
 const COMPARED: usize = 24;
@@ -36,14 +36,19 @@ pub fn fold(source: &mut Source, what: &str, deadline: &Deadline, console: &dyn 
     let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
     let mode = if antialias { Antialias::On } else { Antialias::Off };
     let (held, seen): (Vec<&View>, Vec<&View>) = views.iter().partition(|v| v.held);
-    let mut shots = chosen(&seen, VIEWS);
+    // Every time is shown, so that no Gaussian with a short lifespan is missed.
+    let mut times: Vec<f64> = seen.iter().map(|v| v.time).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let most = VIEWS.max(times.len());
+    let mut shots = chosen(&seen, most);
     if deadline.is_set() {
         // The first round is a warm-up that is timed: one view in all passes.
         let began = deadline.now();
         fold_head(&source.scene, &shots[..1], DEGREE, mode, &mut |_, _| {})?;
         let each = (deadline.now() - began).max(f64::MIN_POSITIVE);
-        let most = (SHARE * deadline.left().max(0.0) / each) as usize;
-        shots = chosen(&seen, most.clamp(1, VIEWS));
+        let affordable = (SHARE * deadline.left().max(0.0) / each) as usize;
+        shots = chosen(&seen, affordable.clamp(1, most));
     }
     let progress = &mut |done, total| console.phase("folding the network into spherical harmonics", done, total);
     let folded = fold_head(&source.scene, &shots, DEGREE, mode, progress)?;

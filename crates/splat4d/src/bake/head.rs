@@ -11,15 +11,13 @@ use crate::math::cholesky::Cholesky;
 use crate::math::sh::{MAX_COEFFS, basis, coeffs, degree_of};
 use crate::math::{Real, se3};
 use crate::motion::spacetime::FEATURE_TABLE;
-use crate::motion::{Spacetime, SpacetimeSpec, Spec};
 use crate::render::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use crate::scene::head::{HEAD_IN, HEAD_OUT};
-use crate::scene::{Camera, Color, Grads, HeadKeys, Params, SH, Splats, Table, Time};
+use crate::scene::{Camera, Color, Grads, HeadKeys, SH, Splats, Table, Time};
 use crate::{Error, Result};
-use std::sync::Arc;
 
-/// Passes over the images. Six more gain less than 0.1 dB (studies/records/2026-11-28-pixel-head.md).
-const PASSES: usize = 10;
+/// Passes over the images (studies/records/2026-11-28-pixel-head.md).
+const PASSES: usize = 5;
 /// Weight of small coefficients above degree 0, share of a Gaussian's weight in the images: directions that no image shows are
 /// then not invented.
 const RIDGE: f64 = 0.003;
@@ -29,8 +27,8 @@ const FLOOR: f64 = 1e-6;
 /// The scene without its head, its colours as spherical harmonics of at least `degree` that look alike from these cameras at
 /// these times (seconds). Colours that change with time keep their mean. A scene without a head is returned unchanged.
 ///
-/// `progress` gets the finished and the total number of renders. Errors: no image; a model around the features that is
-/// not `spacetime`.
+/// `progress` gets the finished and the total number of renders. Errors: no image; a model around the features that cannot
+/// be without them.
 pub fn fold_head(
     scene: &Scene<f32>,
     shots: &[(f64, Camera)],
@@ -48,14 +46,18 @@ pub fn fold_head(
     let mut renderer = Renderer::<f32>::new(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut with_head, mut own) = (Evaluation::default(), Evaluation::default());
     let (mut truth, mut image, mut pixels) = (Image::default(), Image::default(), RenderGrads::default());
+    let mut truths: Vec<Vec<f32>> = Vec::with_capacity(shots.len());
     let mut fits: Vec<Fit> = plain.layers.iter().map(|l| Fit::new(&l.params[SH])).collect();
     let mut shares = Vec::new();
     for pass in 0..PASSES {
         let mut d: Vec<Grads<f32>> = plain.layers.iter().map(|l| Grads::new(&l.params)).collect();
         for (i, (time, camera)) in shots.iter().enumerate() {
             progress(pass * shots.len() + i, PASSES * shots.len());
-            scene.at(Time(*time), &mut with_head);
-            renderer.render(&Shot::new(&scene.splats(&with_head), camera, scene.background), &mut truth);
+            if pass == 0 {
+                scene.at(Time(*time), &mut with_head);
+                renderer.render(&Shot::new(&scene.splats(&with_head), camera, scene.background), &mut truth);
+                truths.push(truth.color.data.iter().map(|t| t.clamp(0.0, 1.0)).collect());
+            }
             plain.at(Time(*time), &mut own);
             let splats = plain.splats(&own);
             let shot = Shot::new(&splats, camera, plain.background);
@@ -64,7 +66,7 @@ pub fn fold_head(
                 renderer.last_contributions(&mut shares);
                 add_normals(&mut fits, &splats, camera, &shares);
             }
-            image.color.data.iter_mut().zip(&truth.color.data).for_each(|(x, t)| *x -= t.clamp(0.0, 1.0));
+            image.color.data.iter_mut().zip(&truths[i]).for_each(|(x, t)| *x -= t);
             let grads = ImageGrads { color: &image.color, alpha: None, depth: None, extra: None };
             renderer.backward(&shot, &grads, &mut sh_grads(&splats, &mut d), &mut pixels);
         }
@@ -79,14 +81,9 @@ pub fn fold_head(
 fn without_features(scene: &Scene<f32>, degree: usize) -> Result<Scene<f32>> {
     let mut out = Scene { head: Head::Identity, ..scene.clone() };
     for layer in &mut out.layers {
-        if let Spec::Spacetime(spec) = layer.motion.spec()
-            && spec.features.is_some()
-        {
-            let plain = SpacetimeSpec { features: None, ..spec };
-            // The model's own tables come first, features after them: the keys stay the same.
-            let motion = Spacetime::new(plain, &mut Params::<f32>::new(0, 1, layer.life.columns()))?;
+        if let Some(motion) = layer.motion.without_features() {
             layer.params = layer.params.without(&[FEATURE_TABLE, HEAD_IN, HEAD_OUT]);
-            layer.motion = Arc::new(motion);
+            layer.motion = motion;
         }
         if HeadKeys::of(&layer.params).is_some() {
             scene.without_head("spherical harmonics")?;
@@ -204,10 +201,10 @@ mod tests {
     use crate::device;
     use crate::layers::Layer;
     use crate::math::{Rng, Se3};
-    use crate::motion::build;
     use crate::motion::spacetime::FeatureSpec;
+    use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
-    use crate::scene::{GEOMETRY, LifeKind};
+    use crate::scene::{GEOMETRY, LifeKind, Params};
 
     /// A ball of Gaussians whose head reddens what is seen along x.
     fn headed() -> Scene<f32> {

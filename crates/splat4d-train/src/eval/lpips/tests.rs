@@ -222,3 +222,31 @@ fn unfit_weights_are_named() {
         .collect();
     assert!(load(&renamed).is_ok());
 }
+
+/// With the published weights, which are not in the repository: `SPLAT4D_LPIPS` names a folder with squeeze.safetensors and
+/// the example images of the `lpips` repository. Expected: computed in f64 by another program.
+#[test]
+fn squeezenet_equals_another_program_where_weights_are_given() {
+    use crate::capture::Rgb8;
+    use splat4d::format::safetensors::SafeTensors;
+    let Some(folder) = std::env::var_os("SPLAT4D_LPIPS").map(std::path::PathBuf::from) else {
+        return println!("skipped: SPLAT4D_LPIPS names no folder");
+    };
+    let bytes = std::fs::read(folder.join("squeeze.safetensors")).unwrap();
+    let file = SafeTensors::read(&bytes).unwrap();
+    let tensor = |name: &str| file.tensor(name).ok().map(|t| (t.shape().to_vec(), t.as_f32().unwrap().to_vec()));
+    let lpips = Lpips::load(tensor).unwrap();
+    assert_eq!(lpips.net(), Net::Squeeze);
+    let planes = |name: &str| {
+        let rgb = Rgb8::read(&folder.join(name)).unwrap();
+        let n = rgb.width * rgb.height;
+        let data = (0..3 * n).map(|i| f32::from(rgb.data[i % n * 3 + i / n]) / 255.0).collect();
+        Planes { channels: 3, height: rgb.height, width: rgb.width, data }
+    };
+    let truth = planes("ex_ref.png");
+    for (name, expected) in [("ex_p0.png", 0.711_047_6), ("ex_p1.png", 0.147_901_6)] {
+        let found = lpips.distance(&planes(name), &truth, InputScaling::Signed).unwrap();
+        println!("{name}: {found:.7}, expected {expected}");
+        assert!((found - expected).abs() < 1e-5, "{name}: {found}");
+    }
+}
