@@ -10,6 +10,7 @@ use splat4d_cli::interrupt;
 use splat4d_workflow::draw::antialias;
 use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
 use splat4d_workflow::measure::{SIZE, Side, Subject, What, in_turns, measured_views};
+use splat4d_workflow::playable;
 use splat4d_workflow::run_folder::Run;
 use splat4d_workflow::source::read_scene;
 use std::fmt::Write;
@@ -78,6 +79,8 @@ struct Cell {
     side: Side,
     /// Size of the file that a player gets, bytes.
     playback_bytes: Option<u64>,
+    /// Images a second of that file.
+    file_fps: Option<f64>,
     steps: usize,
     ms_per_step: f64,
     peak_memory: Option<u64>,
@@ -191,16 +194,22 @@ fn judge(folder: &Path, capture: &str, model: &str, console: &Console) -> anyhow
     let run = Run::open(folder)?;
     let scene = read_scene(&run.scene_file()?)?;
     let antialias = antialias(run.recipe()?.appearance.antialias);
-    let subjects = [Subject { what: What::Scene(&scene), antialias }];
+    let file = std::fs::read(playable::of_run(folder)).ok();
+    let baked = file.map(|bytes| Subject { what: What::File(bytes.into()), antialias });
+    let subjects: Vec<Subject<'_>> =
+        std::iter::once(Subject { what: What::Scene(&scene), antialias }).chain(baked).collect();
     let measured_views = measured_views(&run.views()?, scene.clip, SIZE);
     let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total))?;
-    let [side] = <[Side; 1]>::try_from(sides).expect("one subject gives one side");
+    let mut sides = sides.into_iter();
+    let side = sides.next().expect("a side for every subject");
+    let file_fps = sides.next().map(|file| file.fps);
     let steps = run.iteration().unwrap_or(0);
     Ok(Cell {
         capture: capture.into(),
         model: model.into(),
         refused: None,
         side: side.scored_by(&run),
+        file_fps,
         playback_bytes: run.number("playback_bytes").map(|b| b as u64),
         steps,
         ms_per_step: run.number("seconds").unwrap_or(0.0) * 1e3 / steps.max(1) as f64,
@@ -213,7 +222,7 @@ fn markdown(cells: &[Cell], args: &Args) -> String {
         "Trained for {} minutes a cell on images reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
          difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out \
          views, `moving` is PSNR of dynamic regions. `scene` is the learnt state in 32-bit floats, `file` the \
-         playback file. Frames a second: the learnt state, end to end, 800x800.\n",
+         playback file. Frames a second: the learnt state and the playback file, image by image alternately, end to end, 800x800.\n",
         args.minutes, args.downscale
     );
     let mut captures: Vec<&str> = Vec::new();
@@ -226,7 +235,7 @@ fn markdown(cells: &[Cell], args: &Args) -> String {
         let _ = write!(
             out,
             "\n### {capture}\n\n| model | PSNR | SSIM | moving | flicker | Gaussians | scene | file | steps | ms/step | \
-             frames/s | memory |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n"
+             frames/s | file, frames/s | memory |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n"
         );
         for cell in cells.iter().filter(|c| c.capture == capture) {
             let _ = writeln!(out, "{}", line(cell));
@@ -237,13 +246,13 @@ fn markdown(cells: &[Cell], args: &Args) -> String {
 
 fn line(cell: &Cell) -> String {
     if let Some(why) = &cell.refused {
-        return format!("| `{}` | {why} |{}", cell.model, " |".repeat(10));
+        return format!("| `{}` | {why} |{}", cell.model, " |".repeat(11));
     }
     let s = &cell.side;
     let number = |v: Option<f64>, digits: usize| v.map_or_else(String::new, |v| format!("{v:.digits$}"));
     let bytes = |b: Option<u64>| b.map_or_else(String::new, human_bytes);
     format!(
-        "| `{}` | {} | {} | {} | {} | {} | {} | {} | {} | {:.1} | {:.1} | {} |",
+        "| `{}` | {} | {} | {} | {} | {} | {} | {} | {} | {:.1} | {:.1} | {} | {} |",
         cell.model,
         number(s.psnr, 2),
         number(s.ssim, 4),
@@ -255,6 +264,7 @@ fn line(cell: &Cell) -> String {
         grouped(cell.steps),
         cell.ms_per_step,
         s.fps,
+        number(cell.file_fps, 1),
         bytes(cell.peak_memory)
     )
 }

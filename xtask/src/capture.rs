@@ -5,7 +5,7 @@ use crate::files::{png, write_file};
 use crate::metrics::Motion;
 use crate::picture::shade;
 use crate::raster::{Visibility, rasterize};
-use crate::scene::{FPS, FRAMES, Frame, Stage};
+use crate::scene::{FPS, FRAMES, Frame, NAMES, Stage};
 use crate::truth;
 use crate::vector::{V3, sin_cos, v3};
 use anyhow::{Context, Result, ensure};
@@ -187,12 +187,15 @@ fn description(cameras: &[Camera], maps: bool) -> Result<Vec<u8>> {
         }
         entry
     };
-    let capture = json!({
+    let mut capture = json!({
         "version": 1, "name": "knight", "fps": FPS, "up": [0, 1, 0],
         "hold_out": {"cameras": HELD_OUT.map(|c| cameras[c].name.clone())},
         "points": "points.ply",
         "cameras": cameras.iter().map(entry).collect::<Vec<_>>(),
     });
+    if maps {
+        capture["labels"] = json!(NAMES);
+    }
     let mut text = serde_json::to_string_pretty(&capture)?;
     text.push('\n');
     Ok(text.into_bytes())
@@ -225,6 +228,18 @@ mod tests {
     #[test]
     fn the_committed_images_equal_rendered_ones() {
         check(&bundled_folder(), &[(8, 14)]).expect("same bytes");
+    }
+
+    #[test]
+    fn maps_are_listed_with_the_names_of_their_labels() {
+        let cameras = rig();
+        let listed = |maps| -> serde_json::Value {
+            serde_json::from_slice(&description(&cameras, maps).expect("JSON")).expect("JSON")
+        };
+        let (with, without) = (listed(true), listed(false));
+        assert_eq!(with["labels"].as_array().map(Vec::len), Some(NAMES.len()));
+        assert_eq!(with["cameras"][2]["labels"], "labels/cam02/%04d.png");
+        assert!(without["labels"].is_null() && without["cameras"][2]["labels"].is_null());
     }
 
     #[test]

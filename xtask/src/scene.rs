@@ -22,8 +22,10 @@ pub(crate) const FPS: f64 = 30.0;
 pub(crate) const ORB_APPEARS: usize = 9;
 /// First frame without the painted crate.
 pub(crate) const CRATE_LEAVES: usize = 18;
-/// Number of objects, the static set (0) included: knight 1, mage 2, ball 3, crate 4, orb 5.
-pub(crate) const OBJECTS: usize = 6;
+/// Names of the objects by their number.
+pub(crate) const NAMES: [&str; 6] = ["hall", "knight", "mage", "ball", "crate", "orb"];
+/// Number of objects, the static set (0) included.
+pub(crate) const OBJECTS: usize = NAMES.len();
 
 /// The hall: back wall, side walls and the wall behind the cameras, all seen from inside.
 pub(crate) const BACK: f64 = -4.2;

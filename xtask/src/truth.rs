@@ -47,11 +47,12 @@ pub(crate) fn write_maps(
     }
 }
 
-/// Adds what [`write_maps`] wrote to a camera's entry of `capture.json`. Labels are not listed.
+/// Adds what [`write_maps`] wrote to a camera's entry of `capture.json`. The names of the labels belong at its top.
 pub(crate) fn list_maps(entry: &mut serde_json::Value, camera: &Camera) {
     entry["depth"] = json!(format!("depth/{}/%04d.png", camera.name));
     entry["depth_scale"] = json!(1.0 / DEPTH_SCALE);
     entry["flow"] = json!(format!("flow/{}/%04d.png", camera.name));
+    entry["labels"] = json!(format!("labels/{}/%04d.png", camera.name));
 }
 
 /// Depth (z in camera axes) at pixel centres, one code per pixel.

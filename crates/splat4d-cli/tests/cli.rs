@@ -16,6 +16,8 @@ mod edit;
 mod folders;
 #[path = "cli/import.rs"]
 mod import;
+#[path = "cli/meshes.rs"]
+mod meshes;
 #[path = "cli/predict.rs"]
 mod predict;
 #[path = "cli/sample.rs"]

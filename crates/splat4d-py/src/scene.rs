@@ -21,8 +21,9 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::draw::{Channel, Painter, Transfer, antialias};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::localising::{LocaliseOptions, localise};
+use splat4d_workflow::meshing::{self, MeshOptions};
 use splat4d_workflow::paths::{Route, View};
 use splat4d_workflow::rendering::{self as films, Focus, Photo, Projection, RenderOptions, Stereo};
 use splat4d_workflow::sequence::timestamps;
@@ -383,12 +384,13 @@ impl Scene {
             }
             (Some("html"), None) => exporting::page(file, &path, None, listener),
             (Some("ply"), _) => {
-                let source = Source::open(file)?;
+                let mut source = Source::open(file)?;
                 source.keep(file, &path, &[])?;
+                not_empty(&source.scene, file)?;
+                exporting::fold(&mut source, listener)?;
                 let scene = &source.scene;
-                not_empty(scene, file)?;
                 let t = t.unwrap_or(scene.clip[0]);
-                let count = exporting::moment(scene, t, false, &path)?;
+                let count = exporting::moment(scene, t, PlyOptions::default(), &path)?;
                 exporting::warn_of_empty(scene, t, count, listener);
                 Ok(())
             }
@@ -417,8 +419,51 @@ impl Scene {
         let mut count = 0;
         let work = |file: &Path, _: &Path| {
             listening(|listener| {
-                let source = exporting::open(file, None)?;
-                count = exporting::frames(file, &source, &folder, &frames, [world, force], listener)?;
+                let mut source = exporting::open(file, None)?;
+                exporting::fold(&mut source, listener)?;
+                count = exporting::frames(
+                    file,
+                    &source,
+                    &folder,
+                    &frames,
+                    (PlyOptions { world, velocities: false }, force),
+                    listener,
+                )?;
+                Ok(())
+            })
+        };
+        crate::errors::warn(py, &self.with_file(py, work)?)?;
+        Ok(count)
+    }
+
+    /// Writes the surfaces that the cameras see as triangle meshes: one at second t [the clip's start] to a .glb, .obj or
+    /// .ply, or one per frame to a folder or a name with `%05d`; returns how many. `voxel`: scene units; `watertight`
+    /// closes the surface; `collision` also fills the floor and leaves colours out (docs/meshes.md). Times as in
+    /// `export_frames`. `force` replaces meshes.
+    #[pyo3(signature = (
+        path, t=None, *, voxel=0.02, watertight=false, collision=false, fps=None, start=None, end=None, force=false
+    ))]
+    #[allow(clippy::too_many_arguments)]
+    fn export_mesh(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        t: Option<f64>,
+        voxel: f64,
+        watertight: bool,
+        collision: bool,
+        fps: Option<f64>,
+        start: Option<f64>,
+        end: Option<f64>,
+        force: bool,
+    ) -> PyResult<usize> {
+        t.map(time).transpose()?;
+        let frames = Frames { fps, from: start, to: end };
+        let options = MeshOptions { voxel, watertight, collision, time: t, frames, force };
+        let mut count = 0;
+        let work = |file: &Path, _: &Path| {
+            listening(|listener| {
+                count = meshing::write(file, &Source::open(file)?, &path, &options, listener)?;
                 Ok(())
             })
         };

@@ -119,6 +119,12 @@ class Scenes(InFolder):
         self.assertEqual(count, len(list((self.folder / "frames").glob("frame_*.ply"))))
         self.scene.export_tracks(self.folder / "near.csv", near=[0, 0, 1], count=2, fps=1)
         self.assertGreater(len((self.folder / "near.csv").read_text().splitlines()), 2)
+        self.assertEqual(self.scene.export_mesh(self.folder / "a.obj", 0.5, voxel=0.1), 1)
+        self.assertIn("\nf ", (self.folder / "a.obj").read_text())
+        self.assertEqual(self.scene.export_mesh(self.folder / "meshes", voxel=0.1, collision=True, fps=2, end=0.5), 2)
+        self.assertTrue((self.folder / "meshes" / "frame_00001.glb").read_bytes().startswith(b"glTF"))
+        with self.assertRaisesRegex(splat4d.Error, "option `voxel`"):
+            self.scene.export_mesh(self.folder / "b.obj", voxel=0)
         with self.assertRaisesRegex(splat4d.Error, "option `tracks` NAME.csv"):
             self.scene.export_tracks(self.folder / "near.txt")
         with self.assertRaisesRegex(splat4d.Error, "channel"):

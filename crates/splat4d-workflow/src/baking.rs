@@ -7,6 +7,7 @@ use crate::deadline::Deadline;
 use crate::draw::{Painter, color_rgb};
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes};
+use crate::folding::fold;
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use crate::sound;
@@ -257,6 +258,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
     let read = if let SoundChoice::File(file) = &baking.sound { vec![file.as_path()] } else { Vec::new() };
     source.keep_all(from, &std::iter::once(out).chain(report).collect::<Vec<_>>(), &read)?;
     source.sound = sound::chosen(source.sound.take(), &baking.sound, &source.scene, out, listener)?;
+    fold(&mut source, "a playback file", &baking.deadline, listener)?;
     if baking.options.repeat > 1 && source.sound.take().is_some() {
         listener.result("the sound is left out: option `repeat` repeats the clip, and would need it repeated");
     }

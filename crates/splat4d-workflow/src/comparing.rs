@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are
 /// those of 3DGS' `results.json`, whatever their case.
-pub const SCORES: [(&str, usize, bool); 8] = [
+pub const SCORES: [(&str, usize, bool); 9] = [
     ("PSNR", 2, true),
     ("PSNR-dynamic", 2, true),
     ("PSNR-foreground", 2, true),
@@ -16,6 +16,7 @@ pub const SCORES: [(&str, usize, bool); 8] = [
     ("LPIPS", 4, false),
     ("LPIPS-vgg", 4, false),
     ("LPIPS-alex", 4, false),
+    ("LPIPS-squeeze", 4, false),
     ("flicker", 3, false),
 ];
 

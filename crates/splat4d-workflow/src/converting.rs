@@ -1,8 +1,10 @@
 //! From any scene to the formats of other programs, with axes, order and fade of each.
 
 use crate::baking::{self, Baking};
+use crate::deadline::Deadline;
 use crate::events::Listener;
 use crate::files::{self, either, grouped, human_bytes};
+use crate::folding::fold;
 use crate::programs::Program;
 use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
@@ -179,6 +181,10 @@ pub fn run(args: &Conversion, console: &dyn Listener) -> Result<()> {
     }
     read_linear(&mut source, &args.linear);
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    let target = asked(args)?.1;
+    if target != Target::Scene {
+        fold(&mut source, target.name(), &Deadline::default(), console)?;
+    }
     write(args, source, console)
 }
 

@@ -6,6 +6,7 @@ use crate::deadline::{Deadline, unless_stopped};
 use crate::draw::{Channel, Painter};
 use crate::events::Listener;
 use crate::files::{self, human_seconds};
+use crate::folding::fold;
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
 use crate::playable;
 use crate::report::{self, refined_in_words};
@@ -215,8 +216,9 @@ pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> R
     if run.join(ORDER).is_file() || Chunked::is(run) {
         return Ok(());
     }
-    let baked = Source::open(run).and_then(|source| {
+    let baked = Source::open(run).and_then(|mut source| {
         not_empty(&source.scene, run)?;
+        fold(&mut source, "a playback file", deadline, console)?;
         let title = Run::open(run)?.name();
         let baking = Baking { deadline: deadline.clone(), ..Baking::default() };
         bake_into(&source, &title, &run.join(playable::FILE), &baking, console)
@@ -562,6 +564,7 @@ pub(crate) fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         ("MS-SSIM", "MS-SSIM", 4, ""),
         ("LPIPS-vgg", "LPIPS (VGG)", 4, ""),
         ("LPIPS-alex", "LPIPS (AlexNet)", 4, ""),
+        ("LPIPS-squeeze", "LPIPS (SqueezeNet)", 4, ""),
         ("flicker", "flicker", 3, "/255"),
     ] {
         if let Some(value) = score(key) {

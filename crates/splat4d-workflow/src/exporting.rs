@@ -1,18 +1,21 @@
 //! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and
 //! paths of its Gaussians, or of requested points, as JSON or CSV.
 
+use crate::deadline::Deadline;
 use crate::events::Listener;
 use crate::files;
+use crate::folding;
 use crate::playable::Playable;
 use crate::point_queries::{self, QueryResult};
 use crate::run_folder::Run;
 use crate::sequence;
 use crate::source::{Source, keep_all, not_empty};
 use serde_json::json;
-use splat4d::flow::tracks::{Tracks, every, nearest};
-use splat4d::layers::{Scene, freeze};
+use splat4d::flow::tracks::{Member, Tracks, every, nearest};
+use splat4d::flow::velocities;
+use splat4d::layers::{Evaluation, Scene, freeze};
 use splat4d::math::Rng;
-use splat4d::scene::{RowEdit, Space, Time, labels};
+use splat4d::scene::{RowEdit, Rows, Space, Table, Time, labels};
 use splat4d::{Error, Result, format};
 use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
@@ -70,6 +73,11 @@ pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
     Ok(source)
 }
 
+/// Folds a network that makes colours into spherical harmonics, for files of Gaussians. Errors: its cameras are unknown.
+pub fn fold(source: &mut Source, listener: &dyn Listener) -> Result<()> {
+    folding::fold(source, "a .ply file", &Deadline::default(), listener)
+}
+
 /// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence
 /// of ours.
 ///
@@ -79,7 +87,7 @@ pub fn frames(
     source: &Source,
     folder: &Path,
     frames: &Frames,
-    [world, force]: [bool; 2],
+    (options, force): (PlyOptions, bool),
     listener: &dyn Listener,
 ) -> Result<usize> {
     let (fps, times) = frames.of(&source.scene)?;
@@ -87,7 +95,7 @@ pub fn frames(
     let read = sequence::Read { path, run: source.run.as_ref() };
     let owned = sequence::take(&[&pattern], times.len(), &read, "export", force)?;
     for (i, &time) in times.iter().enumerate() {
-        moment(&source.scene, time, world, &pattern.file(i))?;
+        moment(&source.scene, time, options, &pattern.file(i))?;
         listener.phase("exporting", i + 1, times.len());
     }
     owned.finished();
@@ -98,14 +106,35 @@ pub fn frames(
     Ok(times.len())
 }
 
-/// Whether tracks are written as JSON. Errors: neither that nor CSV.
-fn is_json(out: &Path) -> Result<bool> {
-    match out.extension().map(|e| e.to_ascii_lowercase()) {
-        Some(e) if e == "json" => Ok(true),
-        Some(e) if e == "csv" => Ok(false),
-        _ => Err(Error::input("tracks are written as .csv or .json")
-            .at(out.display())
-            .remedy("Use option `tracks` NAME.csv or option `tracks` NAME.json.")),
+/// What a .ply of one time contains.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PlyOptions {
+    /// Positions in the capture's world, in double precision.
+    pub world: bool,
+    /// Velocities as `vx`, `vy`, `vz`, scene units per second.
+    pub velocities: bool,
+}
+
+/// Format of tracks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum TrackFormat {
+    Csv,
+    Json,
+    /// Arrays of NumPy, with velocities.
+    Npz,
+}
+
+impl TrackFormat {
+    /// By the ending. Errors: another one.
+    fn of(out: &Path) -> Result<Self> {
+        match out.extension().map(|e| e.to_ascii_lowercase()) {
+            Some(e) if e == "json" => Ok(Self::Json),
+            Some(e) if e == "csv" => Ok(Self::Csv),
+            Some(e) if e == "npz" => Ok(Self::Npz),
+            _ => Err(Error::input("tracks are written as .csv, .json or .npz")
+                .at(out.display())
+                .remedy("Use option `tracks` NAME.csv, option `tracks` NAME.json or option `tracks` NAME.npz.")),
+        }
     }
 }
 
@@ -114,7 +143,12 @@ fn is_json(out: &Path) -> Result<bool> {
 ///
 /// Errors: a list that cannot be read; more numbers than a file should have.
 pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, listener: &dyn Listener) -> Result<()> {
-    let (scene, json) = (&source.scene, is_json(out)?);
+    let (scene, format) = (&source.scene, TrackFormat::of(out)?);
+    if format == TrackFormat::Npz {
+        return Err(Error::input("paths of given points have no velocities, which an .npz contains")
+            .at(out.display())
+            .remedy("Use option `tracks` NAME.csv or option `tracks` NAME.json."));
+    }
     let (_, times) = frames.of(scene)?;
     let views = source.views()?;
     let asked =
@@ -132,7 +166,7 @@ pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, liste
             result.len()
         ));
     }
-    files::write(out, if json { result.to_json() } else { result.to_csv() }.as_bytes())?;
+    files::write(out, if format == TrackFormat::Json { result.to_json() } else { result.to_csv() }.as_bytes())?;
     listener.result(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
     listener.emit(&json!({
         "type": "exported", "points": result.len(), "moments": times.len(), "missing": result.missing(),
@@ -145,7 +179,7 @@ pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, liste
 ///
 /// Errors: no such label; more numbers than a file should have.
 pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: &dyn Listener) -> Result<()> {
-    let json = is_json(out)?;
+    let format = TrackFormat::of(out)?;
     let (_, times) = options.frames.of(scene)?;
     let mut members = match options.near {
         None => every(scene, options.every.max(1)),
@@ -172,20 +206,72 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     }
     let followed = Tracks::follow(scene, &members, &times);
     let offset = if options.world { scene.offset } else { [0.0; 3] };
-    let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
-    files::write(out, text.as_bytes())?;
+    let bytes = match format {
+        TrackFormat::Json => followed.to_json(scene, offset).into_bytes(),
+        TrackFormat::Csv => followed.to_csv(scene, offset).into_bytes(),
+        TrackFormat::Npz => scene_flow(scene, &followed, offset)?,
+    };
+    files::write(out, &bytes)?;
     listener.result(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
     listener.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     listener.written(out);
     Ok(())
 }
 
-/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the
-/// capture's world, in double precision.
-pub fn moment(scene: &Scene<f32>, time: f64, world: bool, out: &Path) -> Result<usize> {
+/// Tracks with their velocities as an .npz: `times` [T] in seconds, `positions` [T, N, 3] in scene units and `velocities` [T, N, 3]
+/// in scene units per second, NaN where a Gaussian is not active, `layers` and `gaussians` [N].
+fn scene_flow(scene: &Scene<f32>, tracks: &Tracks, offset: [f64; 3]) -> Result<Vec<u8>> {
+    let (members, times) = (&tracks.members, &tracks.times);
+    let shape = [times.len(), members.len(), 3];
+    let mut positions = vec![f32::NAN; shape.iter().product()];
+    let mut velocities = positions.clone();
+    let mut first = 0;
+    for of_layer in members.chunk_by(|a, b| a.layer == b.layer) {
+        let layer = &scene.layers[of_layer[0].layer];
+        let rows: Vec<u32> = of_layer.iter().map(|m| m.row).collect();
+        let mut own = Table::default();
+        for (k, &t) in times.iter().enumerate() {
+            let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(&rows), Time(t));
+            layer.motion.velocity(&seen.tape(0).query(&layer.params), &mut own);
+            for j in 0..rows.len() {
+                let Some(point) = tracks.track(first + j)[k] else { continue };
+                let moving = layer.frame.vector(own.read::<3>(j, 0).map(f64::from));
+                let at = 3 * (k * members.len() + first + j);
+                for axis in 0..3 {
+                    positions[at + axis] = (f64::from(point[axis]) + offset[axis]) as f32;
+                    velocities[at + axis] = moving[axis] as f32;
+                }
+            }
+        }
+        first += of_layer.len();
+    }
+    let numbers = |f: &dyn Fn(&Member) -> f32| members.iter().map(f).collect::<Vec<f32>>();
+    let (layers, gaussians) = (numbers(&|m| m.layer as f32), numbers(&|m| m.row as f32));
+    let times: Vec<f32> = times.iter().map(|t| *t as f32).collect();
+    let mut out = Vec::new();
+    format::npy::write_archive(
+        &[
+            ("times", &[times.len()], &times),
+            ("positions", &shape, &positions),
+            ("velocities", &shape, &velocities),
+            ("layers", &[members.len()], &layers),
+            ("gaussians", &[members.len()], &gaussians),
+        ],
+        &mut out,
+    )?;
+    Ok(out)
+}
+
+/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many.
+pub fn moment(scene: &Scene<f32>, time: f64, options: PlyOptions, out: &Path) -> Result<usize> {
     let params = freeze(scene, Time(time))?;
+    let moving = options.velocities.then(|| {
+        let mut instant = Evaluation::default();
+        scene.at(Time(time), &mut instant);
+        velocities(scene, &instant)
+    });
     let mut bytes = Vec::new();
-    format::ply::write_placed(&params, (scene.offset, world), &mut bytes)?;
+    format::ply::write_placed(&params, (scene.offset, options.world), moving.as_ref(), &mut bytes)?;
     files::write(out, &bytes)?;
     Ok(params.len())
 }

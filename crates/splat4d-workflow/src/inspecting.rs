@@ -571,7 +571,11 @@ fn of_scene(scene: &Scene<f32>) -> Inspection {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
     if scene.head != Head::Identity {
-        line(&mut text, "colours", "by a small network per pixel (features = full); only render and eval support it");
+        line(
+            &mut text,
+            "colours",
+            "by a small network per pixel (features = full); playback files and exports have spherical harmonics instead",
+        );
     }
     if scene.clip[1] > scene.clip[0] {
         line(

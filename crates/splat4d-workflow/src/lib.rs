@@ -40,9 +40,11 @@
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `activity.rs` | which Gaussians of a scene are active when |
+//! | `folding.rs` | colours that a network makes, as spherical harmonics |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
+//! | `meshing.rs`, `meshing/` | surfaces over time as triangle meshes |
 //! | `localising.rs` | pose and time of images |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `adopting.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; a scene of another program as a run; scores of any scene; of a static one |
@@ -80,6 +82,7 @@ pub mod evaluating;
 pub mod events;
 pub mod exporting;
 pub mod files;
+pub mod folding;
 pub mod foreign;
 pub mod growing;
 #[cfg(feature = "import")]
@@ -88,6 +91,7 @@ pub mod inspecting;
 pub mod labelling;
 pub mod localising;
 pub mod measure;
+pub mod meshing;
 pub mod parts;
 pub mod paths;
 mod picking;

@@ -2,8 +2,10 @@
 //! other scene baked in memory.
 
 use crate::baking::{Baking, pack, title};
+use crate::deadline::Deadline;
 use crate::events::Listener;
 use crate::files::{self, cannot_read};
+use crate::folding::fold;
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
@@ -38,8 +40,9 @@ impl Playable {
             let title = if index.meta.title.is_empty() { stem() } else { index.meta.title };
             return Ok(Self { title, content: Content::File(file) });
         }
-        let source = Source::open(path)?;
+        let mut source = Source::open(path)?;
         not_empty(&source.scene, path)?;
+        fold(&mut source, "a playback file", &Deadline::default(), console)?;
         source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
         let title = title(&source, path);
         let packed = pack(&source, &title, &Baking::default(), console)?;

@@ -2,6 +2,7 @@
 
 use splat4d::ErrorKind;
 use splat4d::edit::Step;
+use splat4d::format::npy::Npy;
 use splat4d::format::ply::write_placed;
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{GEOMETRY, Params};
@@ -14,7 +15,7 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::evaluating::{Measure, evaluate};
 use splat4d_workflow::events::{Event, Listener, ignore};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::inspecting::{InspectOptions, inspect};
 use splat4d_workflow::labelling::label;
 use splat4d_workflow::localising::{LocaliseOptions, localise};
@@ -37,7 +38,7 @@ fn write_scene(path: &Path) {
         params[GEOMETRY].write(row, LOG_SCALE, [-3.0; 3]);
     }
     let mut bytes = Vec::new();
-    write_placed(&params, ([0.0; 3], false), &mut bytes).unwrap();
+    write_placed(&params, ([0.0; 3], false), None, &mut bytes).unwrap();
     std::fs::write(path, bytes).unwrap();
 }
 
@@ -63,7 +64,7 @@ fn a_scene_is_baked_converted_and_exported_by_functions() {
     exporting::page(&scene, &at("a.html"), None, listener).unwrap();
     assert!(std::fs::read_to_string(at("a.html")).unwrap().contains("<html"));
     let source = Source::open(&scene).unwrap();
-    assert_eq!(exporting::moment(&source.scene, 0.0, false, &at("now.ply")).unwrap(), GAUSSIANS);
+    assert_eq!(exporting::moment(&source.scene, 0.0, PlyOptions::default(), &at("now.ply")).unwrap(), GAUSSIANS);
 
     let kinds: Vec<String> = records.borrow().iter().map(|r: &serde_json::Value| r["type"].to_string()).collect();
     assert_eq!(kinds, ["\"baked\"", "\"converted\""]);
@@ -91,10 +92,45 @@ fn scenes_are_inspected_and_followed_by_functions() {
     assert_eq!(all.lines().count() - 1, GAUSSIANS * (one.lines().count() - 1), "{one}");
     let error = exporting::tracks(&source.scene, &options(None), &at("all.txt"), &ignore).unwrap_err().to_string();
     assert!(error.contains("option `tracks` NAME.csv") && !error.contains("--"), "{error}");
-    let count = exporting::frames(&at("scene.ply"), &source, &at("frames"), &frames, [false, false], &ignore).unwrap();
+    let with_velocities = (PlyOptions { velocities: true, ..PlyOptions::default() }, false);
+    let count = exporting::frames(&at("scene.ply"), &source, &at("frames"), &frames, with_velocities, &ignore).unwrap();
+    let frame = std::fs::read(at("frames/frame_00000.ply")).unwrap();
+    assert!(String::from_utf8_lossy(&frame).contains("property float vz\nend_header"), "velocities are written");
+    assert_eq!(Source::open(&at("frames/frame_00000.ply")).unwrap().scene.len(), GAUSSIANS);
     assert!(count > 0 && at("frames/frame_00000.ply").is_file());
     let error = localise(&at("scene.ply"), &[at("a.png")], &LocaliseOptions::default(), &ignore).unwrap_err();
     assert!(error.to_string().contains("option `start`"), "{error}");
+}
+
+/// Positions differ from time to time by the velocities that are next to them.
+#[test]
+fn scene_flow_is_written_with_its_positions() {
+    let folder = tempfile::tempdir().unwrap();
+    let example = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/knight.s4d"));
+    let source = exporting::open(example, None).unwrap();
+    let frames = Frames { fps: Some(2000.0), from: Some(0.4), to: Some(0.401) };
+    let options = TrackOptions { frames, every: 40, ..TrackOptions::default() };
+    let out = folder.path().join("flow.npz");
+    exporting::tracks(&source.scene, &options, &out, &ignore).unwrap();
+    let bytes = std::fs::read(&out).unwrap();
+    let array = |name: &str| Npy::read_member(&bytes, name).unwrap();
+    let (times, x, v) = (array("times").to_f64(), array("positions"), array("velocities"));
+    assert_eq!((x.shape.clone(), v.shape.clone(), times.len()), (v.shape.clone(), x.shape.clone(), x.shape[0]));
+    let (count, x, v) = (3 * x.shape[1], x.to_f64(), v.to_f64());
+    let step = times[1] - times[0];
+    let (mut fastest, mut off) = (0.0f64, Vec::new());
+    for k in 0..count {
+        let moved = (x[count + k] - x[k]) / step;
+        if moved.is_finite() {
+            fastest = fastest.max(v[k].abs());
+            off.push((moved - v[k]).abs());
+        }
+    }
+    off.sort_by(f64::total_cmp);
+    // Positions are 32-bit floats, so that a difference over half a millisecond is coarse.
+    assert!(off.len() > 300 && fastest > 0.5 && off[off.len() * 9 / 10] < 0.02, "{fastest} {off:?}");
+    let points = exporting::points(&source, Path::new("asked.csv"), &frames, &out, &ignore).unwrap_err().to_string();
+    assert!(points.contains("NAME.csv"), "{points}");
 }
 
 #[test]

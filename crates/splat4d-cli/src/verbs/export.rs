@@ -1,13 +1,15 @@
-//! `export`: a scene at one or several times as 3DGS .ply files, the whole scene as one page with its player, or
-//! positions of Gaussians or of requested points as JSON or CSV.
+//! `export`: a scene at one or several times as 3DGS .ply files or as triangle meshes, the whole scene as one page with
+//! its player, or positions of Gaussians or of requested points as JSON or CSV.
 
 use crate::console::Console;
+use clap::ArgGroup;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use splat4d::Error;
 use splat4d_workflow::converting::{self, Conversion};
-use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::exporting::{self, Frames, PlyOptions, TrackOptions};
 use splat4d_workflow::files;
+use splat4d_workflow::meshing::{self, MeshOptions};
 use splat4d_workflow::programs::{PROGRAMS, Program};
 use std::path::{Path, PathBuf};
 
@@ -21,9 +23,14 @@ Examples:
   splat4d export runs/knight --html -o index.html --link knight.s4d    for a web server
   splat4d export runs/knight --tracks tracks.csv           positions at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
+  splat4d export runs/knight --tracks flow.npz             scene flow: positions and velocities
+  splat4d export runs/knight --sequence frames/ --velocities
   splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
   splat4d export runs/knight --tracks paths.csv --points asked.csv    given points
   splat4d export runs/knight -o knight.ply --time 0.5 --label knight
+  splat4d export runs/knight --mesh knight.glb --time 0.5              triangles; .obj and .ply too
+  splat4d export runs/knight --mesh meshes/ --fps 10 --watertight      frame_00000.glb ...
+  splat4d export runs/knight --mesh walls.%04d.obj --collision --voxel 0.05    for physics
 
 A file of points has a header and one line per point, either a camera's pixel at a time or a position at a time:
   camera,x,y,time          time,x,y,z           time,x,y,z,camera
@@ -31,15 +38,15 @@ A file of points has a header and one line per point, either a camera's pixel at
 Pixels are those of the camera's image, the first one's centre at 0.5; times are seconds. `visible` is 1 where the \
 camera sees the point, and empty without a camera.";
 
-/// Write a scene as 3DGS .ply files, as an HTML page, or as tracks of its Gaussians
+/// Write a scene as 3DGS .ply files, as triangle meshes, as an HTML page, or as tracks of its Gaussians
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, group(ArgGroup::new("replaceable").args(["sequence", "mesh"])))]
 pub(crate) struct Args {
     /// The run, scene file or .ply; for a page also a playback file
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
     /// The file of one time, or the page
-    #[arg(short, long, value_name = "OUT", required_unless_present_any = ["sequence", "tracks"])]
+    #[arg(short, long, value_name = "OUT", required_unless_present_any = ["sequence", "tracks", "mesh"])]
     output: Option<PathBuf>,
     /// The time, seconds of the scene [default: the clip's start]
     #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "sequence")]
@@ -47,20 +54,21 @@ pub(crate) struct Args {
     /// A folder for one file per frame
     #[arg(long, value_name = "FOLDER", conflicts_with = "output")]
     sequence: Option<PathBuf>,
-    /// Replace a sequence that splat4d wrote to the folder, even a longer one
-    #[arg(long, requires = "sequence")]
+    /// Replace a sequence that splat4d wrote to the folder, even a longer one, or the file of --mesh
+    #[arg(long, requires = "replaceable")]
     force: bool,
-    /// Files per second of a sequence, samples per second of tracks [default: the capture's frame rate]
+    /// Files per second of a sequence or of meshes, samples per second of tracks [default: the capture's frame rate]
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
-    /// First second of a sequence or of tracks
+    /// First second of a sequence, of meshes or of tracks
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     from: Option<f64>,
-    /// Last second of a sequence or of tracks
+    /// Last second of a sequence, of meshes or of tracks
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     to: Option<f64>,
 
-    /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file
+    /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file, or with velocities to this
+    /// .npz
     #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "sequence", "time", "html"])]
     tracks: Option<PathBuf>,
     /// Track these points and their visibility instead of Gaussians
@@ -72,6 +80,9 @@ pub(crate) struct Args {
     /// Add the scene's offset: positions in the capture's world, in double precision (.ply, tracks of Gaussians)
     #[arg(long, conflicts_with_all = ["html", "points"])]
     world: bool,
+    /// Add velocities to every Gaussian of a .ply: vx, vy, vz, scene units per second
+    #[arg(long, conflicts_with_all = ["html", "tracks", "program"])]
+    velocities: bool,
     /// Only every N-th Gaussian's track
     #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
           value_parser = clap::value_parser!(u32).range(1..))]
@@ -89,6 +100,19 @@ pub(crate) struct Args {
     /// Number of nearest Gaussians [default: 1]
     #[arg(long, value_name = "N", requires = "near", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
+
+    /// Write triangle meshes: NAME.glb, .obj or .ply at one time, or NAME.%05d.glb or a folder for one per frame
+    #[arg(long, value_name = "OUT", conflicts_with_all = ["output", "sequence", "tracks", "html", "program", "world"])]
+    mesh: Option<PathBuf>,
+    /// Side of a voxel, scene units: the size of the smallest triangles [default: 0.02]
+    #[arg(long, value_name = "SIZE", requires = "mesh", allow_negative_numbers = true)]
+    voxel: Option<f64>,
+    /// Close the surface: gaps that no camera saw are closed up to 10 voxels, wider ones bound a shell
+    #[arg(long, requires = "mesh")]
+    watertight: bool,
+    /// A mesh for physics: closed, with a filled floor, without colours and normals
+    #[arg(long, requires = "mesh")]
+    collision: bool,
 
     /// Write one HTML page with player and scene; it needs no network and no server. Implied by an output NAME.html
     #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
@@ -115,11 +139,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
     }
-    if args.sequence.is_none() && args.tracks.is_none() {
+    if args.sequence.is_none() && args.tracks.is_none() && args.mesh.is_none() {
         let given = [("--fps", args.fps), ("--from", args.from), ("--to", args.to)];
         if let Some((name, _)) = given.iter().find(|(_, v)| v.is_some()) {
-            return Err(Error::input(format!("{name} applies to a sequence or to tracks"))
-                .remedy("Add --sequence FOLDER or --tracks FILE, or choose one time with --time.")
+            return Err(Error::input(format!("{name} applies to a sequence, to meshes or to tracks"))
+                .remedy("Add --sequence FOLDER, --mesh FOLDER or --tracks FILE, or choose one time with --time.")
                 .into());
         }
     }
@@ -143,9 +167,25 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.link.is_some() {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
-    let source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
+    let mut source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
+    if let Some(out) = &args.mesh {
+        let frames = Frames { fps: args.fps, from: args.from, to: args.to };
+        let options = MeshOptions {
+            voxel: args.voxel.unwrap_or(meshing::VOXEL),
+            watertight: args.watertight,
+            collision: args.collision,
+            time: args.time,
+            frames,
+            force: args.force,
+        };
+        meshing::write(path, &source, out, &options, console)?;
+        return Ok(());
+    }
     let outputs: Vec<&Path> = args.output.iter().chain(&args.tracks).map(PathBuf::as_path).collect();
     source.keep_all(path, &outputs, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
+    if args.tracks.is_none() && args.program.is_none() {
+        exporting::fold(&mut source, console)?;
+    }
     let scene = &source.scene;
     let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {
@@ -169,8 +209,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let named = folder.join(program.frame);
         return Ok(converting::run(&Conversion { frames: true, ..conversion(&named) }, console)?);
     }
+    let options = PlyOptions { world: args.world, velocities: args.velocities };
     if let Some(folder) = &args.sequence {
-        exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
+        exporting::frames(path, &source, folder, &frames, (options, args.force), console)?;
         return Ok(());
     }
     let out = args.output.as_ref().expect("clap requires an output");
@@ -184,7 +225,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if program.is_some() {
         return Ok(converting::run(&Conversion { time: Some(time), ..conversion(out) }, console)?);
     }
-    let n = exporting::moment(scene, time, args.world, out)?;
+    let n = exporting::moment(scene, time, options, out)?;
     exporting::warn_of_empty(scene, time, n, console);
     console.print_line(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));

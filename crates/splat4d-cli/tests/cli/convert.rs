@@ -148,6 +148,37 @@ fn a_scene_with_a_head_renders_and_does_not_convert() {
     run(&["export", "full.safetensors", "--tracks", "a.csv"]).ok();
 }
 
+/// The folder of a run states the cameras that colours are folded for.
+#[test]
+fn a_run_with_a_head_is_baked_exported_and_converted() {
+    let work = tempfile::tempdir().unwrap();
+    let capture = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/knight");
+    let settings =
+        ["features=full", "motion=spacetime", "iterations=12", "downscale=16", "max_frames=2", "max_cap=300"];
+    let settings = settings.iter().flat_map(|s| ["--set", s]);
+    let run = |args: &[&str]| splat4d(args).run_in(work.path());
+    let train: Vec<&str> = ["train", capture, "-o", "run", "--device", "cpu"].into_iter().chain(settings).collect();
+    let said = run(&train).ok();
+    assert!(
+        said.contains("spherical harmonics of degree 3 replace the network") && said.contains("held-out views"),
+        "{said}"
+    );
+    assert!(work.path().join("run/scene.s4d").is_file(), "training ends with a playback file");
+    for args in [
+        &["bake", "run", "-o", "a.s4d"][..],
+        &["convert", "run", "a.splatv"],
+        &["convert", "run", "f_%d.spz", "--frames"],
+        &["export", "run", "-o", "a.ply", "--velocities"],
+        &["export", "run", "-o", "a.html", "--html"],
+    ] {
+        run(args).ok();
+    }
+    // The scene itself keeps its network.
+    run(&["convert", "run", "same.safetensors"]).ok();
+    let same = scene::read(&std::fs::read(work.path().join("same.safetensors")).unwrap()).unwrap();
+    assert_eq!(same.head, Head::Features);
+}
+
 /// A model of every kind whose tables cannot be rotated, in a small box.
 fn models_with_frames() -> Vec<Spec> {
     let skin = SkinSpec { nodes: 6, neighbours: 3, hyper: 2, mask: false };

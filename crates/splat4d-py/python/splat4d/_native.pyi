@@ -198,6 +198,19 @@ class Scene:
         world: bool = False,
         force: bool = False,
     ) -> int: ...
+    def export_mesh(
+        self,
+        path: _Path,
+        t: float | None = None,
+        *,
+        voxel: float = 0.02,
+        watertight: bool = False,
+        collision: bool = False,
+        fps: float | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        force: bool = False,
+    ) -> int: ...
     def export_tracks(
         self,
         path: _Path,

@@ -134,7 +134,7 @@ pub(super) enum Opened<R: BufRead + Seek> {
 }
 
 impl<R: BufRead + Seek> Opened<R> {
-    /// Reads the header. Errors: what the decoder says of it.
+    /// Reads the header. Errors: the decoder's reason.
     pub(super) fn read(mut source: R) -> Result<Self, String> {
         const PNG: &[u8] = b"\x89PNG";
         let begin = source.fill_buf().map_err(text)?;
@@ -179,7 +179,7 @@ impl<R: BufRead + Seek> Opened<R> {
         }
     }
 
-    /// Decodes the pixels, as stored. Errors: what the decoder says of the file.
+    /// Decodes the pixels, as stored. Errors: the decoder's reason.
     pub(super) fn decode(self) -> Result<Raster, String> {
         let ((width, height), channels) = (self.size(), self.channels());
         let too_large = || "its pixels do not fit into memory".to_owned();

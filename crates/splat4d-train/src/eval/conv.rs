@@ -167,17 +167,29 @@ fn add_taps<const FMA: bool, const K: usize>(input: &[f32], w: &[[f32; OUT_BLOCK
     }
 }
 
+/// Windows of a pooling at the right and lower edge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Edge {
+    /// Whole windows only (PyTorch's default).
+    Whole,
+    /// Also windows that begin in the image and end outside (PyTorch's `ceil_mode`).
+    Cut,
+}
+
 /// Largest value of every `side`² window, `stride` apart, without padding; `None` where no window fits.
-pub(super) fn max_pool(input: &Planes<f32>, side: usize, stride: usize) -> Option<Planes<f32>> {
-    let size = |n: usize| Some(n.checked_sub(side)? / stride + 1);
+pub(super) fn max_pool(input: &Planes<f32>, side: usize, stride: usize, edge: Edge) -> Option<Planes<f32>> {
+    let size = |n: usize| {
+        let steps = n.checked_sub(side)?;
+        Some(1 + if edge == Edge::Cut { steps.div_ceil(stride) } else { steps / stride })
+    };
     let (oh, ow) = (size(input.height)?, size(input.width)?);
     let mut out = Planes::new(input.channels, oh, ow);
     out.data.par_chunks_mut(oh * ow).enumerate().for_each(|(c, out)| {
         for y in 0..oh {
             for x in 0..ow {
                 let mut most = f32::NEG_INFINITY;
-                for j in 0..side {
-                    for i in 0..side {
+                for j in 0..side.min(input.height - y * stride) {
+                    for i in 0..side.min(input.width - x * stride) {
                         most = most.max(input.get(c, y * stride + j, x * stride + i));
                     }
                 }

@@ -4,15 +4,17 @@
 //!
 //! | name | shape |
 //! |---|---|
-//! | `features.{i}.weight`, `features.{i}.bias` | as torchvision's AlexNet or VGG16 (i: see below) |
-//! | `lin{l}.model.1.weight`, l = 0..4 | `[1, channels, 1, 1]`, as the PyPI package `lpips` stores them |
+//! | `features.{i}.weight`, `features.{i}.bias` | as torchvision's AlexNet, VGG16 or SqueezeNet 1.1 (i: see below) |
+//! | `features.{i}.squeeze.weight`, `.expand1x1.`, `.expand3x3.`, each with `bias` | SqueezeNet's fire modules |
+//! | `lin{l}.model.1.weight`, l = 0..4, SqueezeNet 0..6 | `[1, channels, 1, 1]`, as the PyPI package `lpips` stores them |
 //!
-//! AlexNet has convolutions at i = 0, 3, 6, 8, 10, VGG16 at 0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28. The names
-//! of the `lpips` package's own state (`net.slice1.0.weight` …) are understood too. Which network it is shows in the
-//! shape of the first convolution. Papers differ in network and in input scaling: always state both.
+//! AlexNet has convolutions at i = 0, 3, 6, 8, 10, VGG16 at 0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28, SqueezeNet one at 0 and
+//! fire modules at 3, 4, 6, 7, 9, 10, 11, 12. The names of the `lpips` package's own state (`net.slice1.0.weight` …) are understood
+//! too. Which network it is shows in the shape of the first convolution and in the fire modules. Papers differ in network and in
+//! input scaling: always state both. `clients/lpips/convert.py` writes such files.
 //! Source: Zhang 2018, `lpips` version 0.1.
 
-use super::conv::{Conv, max_pool};
+use super::conv::{Conv, Edge, max_pool};
 use splat4d::math::Real;
 use splat4d::scene::Planes;
 use splat4d::simd::Simd;
@@ -24,8 +26,9 @@ const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the norm of a feature that is all zero from dividing by zero (`lpips` `normalize_tensor`).
 const NORM_FLOOR: f32 = 1e-10;
 /// The remedy for a weight file that does not fit.
-const REMEDY: &str = "Give a safetensors file with torchvision's `features.*` tensors of AlexNet or VGG16 and the \
-                      `lin*.model.1.weight` tensors of the `lpips` package";
+const REMEDY: &str = "Give a safetensors file with torchvision's `features.*` tensors of AlexNet, VGG16 or \
+                      SqueezeNet 1.1 and the `lin*.model.1.weight` tensors of the `lpips` package \
+                      (clients/lpips/convert.py writes one)";
 
 /// The feature network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,6 +37,8 @@ pub(crate) enum Net {
     Alex,
     /// VGG16; results are labelled `LPIPS-vgg`.
     Vgg,
+    /// SqueezeNet 1.1; results are labelled `LPIPS-squeeze`.
+    Squeeze,
 }
 
 /// Scaling of values in `[0,1]` for the network.
@@ -50,8 +55,10 @@ pub enum InputScaling {
 enum Layer {
     /// Index, slice, inputs, outputs, side, stride, pad; a ReLU follows.
     Conv(usize, usize, [usize; 5]),
+    /// Index, slice, inputs, squeezed channels, outputs of each of its two parts; ReLUs follow all three convolutions.
+    Fire(usize, usize, [usize; 3]),
     /// Side and stride.
-    Pool(usize, usize),
+    Pool(usize, usize, Edge),
     /// A feature is taken here.
     Tap,
 }
@@ -64,10 +71,10 @@ const fn same(index: usize, slice: usize, inputs: usize, outputs: usize) -> Laye
 const ALEX: [Layer; 12] = [
     Layer::Conv(0, 1, [3, 64, 11, 4, 2]),
     Layer::Tap,
-    Layer::Pool(3, 2),
+    Layer::Pool(3, 2, Edge::Whole),
     Layer::Conv(3, 2, [64, 192, 5, 1, 2]),
     Layer::Tap,
-    Layer::Pool(3, 2),
+    Layer::Pool(3, 2, Edge::Whole),
     same(6, 3, 192, 384),
     Layer::Tap,
     same(8, 4, 384, 256),
@@ -81,24 +88,47 @@ const VGG: [Layer; 22] = [
     same(0, 1, 3, 64),
     same(2, 1, 64, 64),
     Layer::Tap,
-    Layer::Pool(2, 2),
+    Layer::Pool(2, 2, Edge::Whole),
     same(5, 2, 64, 128),
     same(7, 2, 128, 128),
     Layer::Tap,
-    Layer::Pool(2, 2),
+    Layer::Pool(2, 2, Edge::Whole),
     same(10, 3, 128, 256),
     same(12, 3, 256, 256),
     same(14, 3, 256, 256),
     Layer::Tap,
-    Layer::Pool(2, 2),
+    Layer::Pool(2, 2, Edge::Whole),
     same(17, 4, 256, 512),
     same(19, 4, 512, 512),
     same(21, 4, 512, 512),
     Layer::Tap,
-    Layer::Pool(2, 2),
+    Layer::Pool(2, 2, Edge::Whole),
     same(24, 5, 512, 512),
     same(26, 5, 512, 512),
     same(28, 5, 512, 512),
+    Layer::Tap,
+];
+
+/// torchvision `squeezenet1_1` (Iandola et al. 2016).
+const SQUEEZE: [Layer; 19] = [
+    Layer::Conv(0, 1, [3, 64, 3, 2, 0]),
+    Layer::Tap,
+    Layer::Pool(3, 2, Edge::Cut),
+    Layer::Fire(3, 2, [64, 16, 64]),
+    Layer::Fire(4, 2, [128, 16, 64]),
+    Layer::Tap,
+    Layer::Pool(3, 2, Edge::Cut),
+    Layer::Fire(6, 3, [128, 32, 128]),
+    Layer::Fire(7, 3, [256, 32, 128]),
+    Layer::Tap,
+    Layer::Pool(3, 2, Edge::Cut),
+    Layer::Fire(9, 4, [256, 48, 192]),
+    Layer::Tap,
+    Layer::Fire(10, 5, [384, 48, 192]),
+    Layer::Tap,
+    Layer::Fire(11, 6, [384, 64, 256]),
+    Layer::Tap,
+    Layer::Fire(12, 7, [512, 64, 256]),
     Layer::Tap,
 ];
 
@@ -108,6 +138,7 @@ impl Net {
         match self {
             Net::Alex => "LPIPS-alex",
             Net::Vgg => "LPIPS-vgg",
+            Net::Squeeze => "LPIPS-squeeze",
         }
     }
 
@@ -115,6 +146,7 @@ impl Net {
         match self {
             Net::Alex => &ALEX,
             Net::Vgg => &VGG,
+            Net::Squeeze => &SQUEEZE,
         }
     }
 }
@@ -123,9 +155,12 @@ impl Net {
 #[derive(Clone, Debug)]
 enum Step {
     Conv(Conv),
+    /// Squeeze, then two convolutions of its result, whose channels are concatenated.
+    Fire([Conv; 3]),
     Pool {
         side: usize,
         stride: usize,
+        edge: Edge,
     },
     /// Weights of the channels' squared differences.
     Tap(Vec<f32>),
@@ -155,10 +190,11 @@ impl Lpips {
         };
         let net = match shape[..] {
             [64, 3, 11, 11] => Net::Alex,
+            [64, 3, 3, 3] if names(3, 2, "squeeze.weight").iter().any(|n| tensor(n).is_some()) => Net::Squeeze,
             [64, 3, 3, 3] => Net::Vgg,
             _ => {
                 let what = format!(
-                    "`{}` has shape {shape:?}: neither AlexNet [64, 3, 11, 11] nor VGG16 [64, 3, 3, 3]",
+                    "`{}` has shape {shape:?}: neither AlexNet [64, 3, 11, 11] nor VGG16 or SqueezeNet [64, 3, 3, 3]",
                     first[0]
                 );
                 return Err(Error::input(what).remedy(REMEDY));
@@ -179,16 +215,27 @@ impl Lpips {
             }
             Ok(data)
         };
+        let conv = |i: usize, slice: usize, part: &str, [inputs, outputs, side, stride, pad]: [usize; 5]| {
+            let weight = claim(&names(i, slice, &format!("{part}weight")), &[outputs, inputs, side, side])?;
+            let bias = claim(&names(i, slice, &format!("{part}bias")), &[outputs])?;
+            Ok::<_, Error>(Conv { outputs, inputs, side, stride, pad, weight, bias })
+        };
         let (mut steps, mut channels, mut taps) = (Vec::new(), 3, 0);
         for layer in net.layers() {
             steps.push(match *layer {
-                Layer::Conv(i, slice, [inputs, outputs, side, stride, pad]) => {
-                    channels = outputs;
-                    let weight = claim(&names(i, slice, "weight"), &[outputs, inputs, side, side])?;
-                    let bias = claim(&names(i, slice, "bias"), &[outputs])?;
-                    Step::Conv(Conv { outputs, inputs, side, stride, pad, weight, bias })
+                Layer::Conv(i, slice, shape) => {
+                    channels = shape[1];
+                    Step::Conv(conv(i, slice, "", shape)?)
                 }
-                Layer::Pool(side, stride) => Step::Pool { side, stride },
+                Layer::Fire(i, slice, [inputs, squeezed, each]) => {
+                    channels = 2 * each;
+                    Step::Fire([
+                        conv(i, slice, "squeeze.", [inputs, squeezed, 1, 1, 0])?,
+                        conv(i, slice, "expand1x1.", [squeezed, each, 1, 1, 0])?,
+                        conv(i, slice, "expand3x3.", [squeezed, each, 3, 1, 1])?,
+                    ])
+                }
+                Layer::Pool(side, stride, edge) => Step::Pool { side, stride, edge },
                 Layer::Tap => {
                     taps += 1;
                     Step::Tap(claim(&[format!("lin{}.model.1.weight", taps - 1)], &[1, channels, 1, 1])?)
@@ -219,12 +266,24 @@ impl Lpips {
         for step in &self.steps {
             match step {
                 Step::Conv(conv) => (a, b) = (conv.relu(self.simd, &a)?, conv.relu(self.simd, &b)?),
-                Step::Pool { side, stride } => (a, b) = (max_pool(&a, *side, *stride)?, max_pool(&b, *side, *stride)?),
+                Step::Fire(convs) => (a, b) = (fire(self.simd, convs, &a)?, fire(self.simd, convs, &b)?),
+                Step::Pool { side, stride, edge } => {
+                    (a, b) = (max_pool(&a, *side, *stride, *edge)?, max_pool(&b, *side, *stride, *edge)?);
+                }
                 Step::Tap(weights) => sum += feature_distance(&a, &b, weights)?,
             }
         }
         Some(sum)
     }
+}
+
+/// The result of a fire module.
+fn fire(simd: Simd, [squeeze, narrow, wide]: &[Conv; 3], image: &Planes<f32>) -> Option<Planes<f32>> {
+    let squeezed = squeeze.relu(simd, image)?;
+    let (mut out, rest) = (narrow.relu(simd, &squeezed)?, wide.relu(simd, &squeezed)?);
+    out.channels += rest.channels;
+    out.data.extend(rest.data);
+    Some(out)
 }
 
 fn scaled(image: &Planes<f32>, scaling: InputScaling) -> Planes<f32> {

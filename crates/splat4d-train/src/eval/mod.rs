@@ -37,8 +37,8 @@ pub struct ViewContext<'a> {
 
 /// All metrics of one view but `PSNR-cc`, which depends on its camera's other views ([`run::assess`]).
 ///
-/// Keys: `PSNR`, `SSIM`, `MS-SSIM`, `D-SSIM`, `PSNR-dynamic`, with masks `PSNR-foreground`, with a network `LPIPS-alex`
-/// or `LPIPS-vgg` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: `[3,H,W]` both; the name is the
+/// Keys: `PSNR`, `SSIM`, `MS-SSIM`, `D-SSIM`, `PSNR-dynamic`, with masks `PSNR-foreground`, with a network `LPIPS-alex`,
+/// `LPIPS-vgg` or `LPIPS-squeeze` (with ` (input 0..1)` behind it for [`InputScaling::Unit`]). Shapes: `[3,H,W]` both; the name is the
 /// image's file name. Panics: shapes differ.
 pub fn score_view(name: &str, render: &Planes<f32>, truth: &Planes<f32>, context: &ViewContext<'_>) -> View {
     let mut view = View::new(name);

@@ -42,8 +42,8 @@ settings! {
         /// Rate of quaternion rates, 1/clip.
         rotation_rate_lr: f64 = 1e-3 => any().unit("1/clip").when(On("spacetime.rotation_rate"));
         /// Features in addition to the base colour, which a small network turns into colour per pixel: none or full
-        /// (the full model of STG; replaces spherical harmonics, sh_degree becomes 0). Such scenes have no playback
-        /// file and no export.
+        /// (the full model of STG; replaces spherical harmonics, sh_degree becomes 0). Playback files and
+        /// exports have spherical harmonics in its place.
         features: Features = Features::None;
         /// Rate of view features (STG, 30,000 steps: 0.0025).
         view_features_lr: f64 = 0.01 => any().when(On("spacetime.features"));

@@ -138,6 +138,7 @@ fn cards(out: &mut String, run: &Run) {
         ("", "MS-SSIM", 4, "", "MS-SSIM"),
         ("", "LPIPS-vgg", 4, "", "LPIPS (VGG)"),
         ("", "LPIPS-alex", 4, "", "LPIPS (AlexNet)"),
+        ("", "LPIPS-squeeze", 4, "", "LPIPS (SqueezeNet)"),
         ("", "LPIPS", 4, "", "LPIPS"),
         ("", "flicker", 3, "/255", "flicker"),
     ] {
@@ -166,7 +167,9 @@ fn cards(out: &mut String, run: &Run) {
         card("", value.into(), unit, &format!("playback file scene.s4d{like}"));
     }
     out.push_str("</div>\n");
-    if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex"].iter().any(|k| run.score(k).is_some()) {
+    if run.results.is_some()
+        && !["LPIPS", "LPIPS-vgg", "LPIPS-alex", "LPIPS-squeeze"].iter().any(|k| run.score(k).is_some())
+    {
         out.push_str("<p class=\"note\">LPIPS was not computed: give its weights with --lpips-weights.</p>\n");
     }
 }

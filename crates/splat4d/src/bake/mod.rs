@@ -14,6 +14,7 @@
 mod bakery;
 mod compare;
 mod fit;
+mod head;
 mod life;
 mod rank;
 mod rate;
@@ -36,6 +37,7 @@ pub use bakery::{Bakery, Curve, Cut};
 #[cfg(test)]
 pub(crate) use compare::Moment;
 pub use compare::{Likeness, Shown, compare};
+pub use head::fold_head;
 
 /// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
 /// less than 40 dB can show (measured; see the tests), at a fraction of the segments that a tenth of it would need.

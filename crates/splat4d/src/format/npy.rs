@@ -129,6 +129,19 @@ impl Npy {
     }
 }
 
+/// Writes arrays of f32 numbers as an .npz (what `np.savez` writes): names, shapes, row-major numbers.
+///
+/// Errors: more than 4 GiB; the sink's. Panics: as [`write_f32`].
+pub fn write_archive(arrays: &[(&str, &[usize], &[f32])], out: &mut impl Write) -> Result<()> {
+    let member = |(name, shape, data): &(&str, &[usize], &[f32])| {
+        let mut bytes = Vec::new();
+        write_f32(shape, data, &mut bytes).map(|()| (format!("{name}.npy"), bytes))
+    };
+    let members = arrays.iter().map(member).collect::<Result<Vec<_>>>()?;
+    let files: Vec<(&str, &[u8])> = members.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
+    super::zip::write(&files, 1, out)
+}
+
 /// Writes f32 numbers of any shape, row-major, as version 1 (what `np.save` writes).
 ///
 /// Errors: the sink's. Panics: the shape does not hold `data.len()` numbers.

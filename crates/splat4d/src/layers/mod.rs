@@ -31,8 +31,8 @@ use crate::motion::{At, Cache, Motion, Tape};
 use crate::scene::GEOMETRY;
 use crate::scene::params::OPACITY;
 use crate::scene::{
-    Grads, HeadKeys, HeadWeights, KeyMasks, LIFE, LifeBuckets, LifeKind, Params, Part, RowEdit, Rows, Space,
-    SplatGrads, Splats, Table, Time,
+    Grads, HeadKeys, HeadWeights, KeyMasks, LIFE, LifeKind, Params, Part, RowEdit, Rows, Space, SplatGrads, Splats,
+    Table, Time,
 };
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
@@ -243,11 +243,6 @@ impl<F: Real> Layer<F> {
             if reach < 0.0 || from > to { [1.0, 0.0] } else { [from, to] }
         };
         rows.iter().enumerate().map(span).collect()
-    }
-
-    /// Buckets for playback over a clip.
-    pub fn buckets(&self, clip: [f64; 2], count: usize) -> LifeBuckets {
-        LifeBuckets::new(self.spans(), clip, count)
     }
 
     /// Computes the query in `tape`: the motion model, then the lifespan, the cross-fade and the frame. Nodes have none
@@ -493,7 +488,10 @@ impl<F: Real> Scene<F> {
                 ErrorKind::Unsupported,
                 format!("{what} cannot hold this scene: a network makes its colours, pixel by pixel (features = full)"),
             )
-            .remedy("Train with --set features=none for that; `render` and `eval` render the scene with it")),
+            .remedy(
+                "Give the folder of its run: `bake`, `export` and `convert` fold the network into spherical harmonics as its cameras \
+                 see them. Or train with --set features=none",
+            )),
         }
     }
 }

@@ -55,7 +55,7 @@ impl Sim3 {
     }
 
     /// s R v: what becomes of a difference of points, or of a velocity.
-    pub(crate) fn vector(&self, v: [f64; 3]) -> [f64; 3] {
+    pub fn vector(&self, v: [f64; 3]) -> [f64; 3] {
         mat_vec(&self.rotation, v).map(|x| self.scale * x)
     }
 

@@ -204,6 +204,12 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         false
     }
 
+    /// The same motion on tables without features for a pixel head; `None`: it has none, or cannot be without them. Keys of
+    /// all other tables stay.
+    fn without_features(&self) -> Option<Arc<dyn Motion<F>>> {
+        None
+    }
+
     /// The motion as a polynomial in time, if it is one.
     fn polynomial(&self) -> Option<Polynomial> {
         None

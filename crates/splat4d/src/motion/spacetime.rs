@@ -191,6 +191,13 @@ impl<F: Real> Motion<F> for Spacetime {
         true
     }
 
+    fn without_features(&self) -> Option<Arc<dyn Motion<F>>> {
+        self.features?;
+        let spec = SpacetimeSpec { features: None, ..self.spec };
+        // The tables of features are the last ones: the keys of the others stay.
+        Some(Arc::new(Self { spec, features: None, ..*self }))
+    }
+
     fn polynomial(&self) -> Option<Polynomial> {
         Some(Polynomial {
             order: self.spec.order,

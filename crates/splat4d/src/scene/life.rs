@@ -132,49 +132,9 @@ impl LifeKind {
     }
 }
 
-/// Exact interval buckets over a clip: the rows alive at t without examining the others.
-#[derive(Clone, Debug, Default)]
-pub struct LifeBuckets {
-    start: f64,
-    width: f64,
-    spans: Vec<[f64; 2]>,
-    buckets: Vec<Vec<u32>>,
-}
-
-impl LifeBuckets {
-    /// Sorts rows with the given spans [from, to] (seconds; from > to: never alive) into `count` buckets over the clip.
-    /// Times outside the clip use the first or last bucket, which also contain everything beyond.
-    pub(crate) fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
-        let count = count.max(1);
-        let width = ((clip[1] - clip[0]) / count as f64).max(f64::MIN_POSITIVE);
-        let mut buckets = vec![Vec::new(); count];
-        let bucket = |t: f64| (((t - clip[0]) / width).floor().clamp(0.0, (count - 1) as f64)) as usize;
-        for (row, [from, to]) in spans.iter().enumerate() {
-            if from <= to {
-                for b in &mut buckets[bucket(*from)..=bucket(*to)] {
-                    b.push(row as u32);
-                }
-            }
-        }
-        Self { start: clip[0], width, spans, buckets }
-    }
-
-    /// The rows whose span holds t, strictly increasing.
-    pub fn active(&self, t: Time, ids: &mut Vec<u32>) {
-        ids.clear();
-        if self.buckets.is_empty() {
-            return;
-        }
-        let b = ((t.0 - self.start) / self.width).floor().clamp(0.0, (self.buckets.len() - 1) as f64) as usize;
-        let alive = |&row: &u32| self.spans[row as usize][0] <= t.0 && t.0 <= self.spans[row as usize][1];
-        ids.extend(self.buckets[b].iter().copied().filter(alive));
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::Rng;
 
     #[test]
     fn derivatives_equal_finite_differences() {
@@ -217,27 +177,6 @@ mod tests {
         assert_eq!(LifeKind::Interval.eval(row, Time(1.49)).sigma, 1.0);
         assert!(LifeKind::Interval.eval(row, Time(1.7)).sigma < 0.2);
         assert_eq!(LifeKind::Infinite.eval([0.0; 3], Time(1e9)).sigma, 1.0);
-    }
-
-    #[test]
-    fn buckets_equal_brute_force() {
-        let rng = Rng::new(1, "buckets", 0);
-        let spans: Vec<[f64; 2]> = (0..500)
-            .map(|i| {
-                let c = rng.uniform(2 * i) * 3.0 - 1.0;
-                let r = rng.uniform(2 * i + 1) * 0.8 - 0.1;
-                [c - r, c + r]
-            })
-            .collect();
-        let buckets = LifeBuckets::new(spans.clone(), [0.0, 1.0], 16);
-        let mut ids = Vec::new();
-        for i in 0..300 {
-            let t = -0.7 + i as f64 * 0.008;
-            buckets.active(Time(t), &mut ids);
-            let brute: Vec<u32> =
-                (0..500u32).filter(|&r| spans[r as usize][0] <= t && t <= spans[r as usize][1]).collect();
-            assert_eq!(ids, brute, "t = {t}");
-        }
     }
 
     #[test]

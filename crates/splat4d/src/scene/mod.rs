@@ -16,7 +16,7 @@ pub mod time;
 
 pub use camera::{Camera, Intrinsics, Lens};
 pub use head::{HeadGrads, HeadKeys, HeadWeights};
-pub use life::{LifeBuckets, LifeKind};
+pub use life::LifeKind;
 pub use masks::KeyMasks;
 pub use params::{Born, GEOMETRY, Grads, Key, LIFE, ParamInfo, Params, RowEdit, SH, Space};
 pub use planes::Planes;

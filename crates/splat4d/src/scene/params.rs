@@ -288,6 +288,16 @@ impl<F: Real> Params<F> {
         *own = table;
     }
 
+    /// A copy without the tables of these names. Keys of tables behind them change.
+    pub(crate) fn without(&self, names: &[&str]) -> Self {
+        let kept = || self.infos.iter().zip(&self.tables).filter(|(info, _)| !names.contains(&info.name.as_str()));
+        Self {
+            infos: kept().map(|(info, _)| info.clone()).collect(),
+            tables: kept().map(|(_, table)| table.clone()).collect(),
+            loaded: self.loaded.clone(),
+        }
+    }
+
     /// Gathers every table of the edit's space. Models correct what copying alone cannot in `Motion::on_edit`.
     pub fn apply(&mut self, edit: &RowEdit) {
         for (info, table) in self.infos.iter().zip(&mut self.tables) {

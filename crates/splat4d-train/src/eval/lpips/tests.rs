@@ -23,6 +23,18 @@ fn weights(net: Net) -> Tensors {
                 add(format!("features.{i}.bias"), vec![outputs], &|r, k| 0.1 * r.normal(k));
                 channels = outputs;
             }
+            Layer::Fire(i, _, [inputs, squeezed, each]) => {
+                for (part, shape) in [
+                    ("squeeze", [squeezed, inputs, 1, 1]),
+                    ("expand1x1", [each, squeezed, 1, 1]),
+                    ("expand3x3", [each, squeezed, 3, 3]),
+                ] {
+                    let spread = (24.0 / (shape[1] * shape[2] * shape[3]) as f64).sqrt();
+                    add(format!("features.{i}.{part}.weight"), shape.to_vec(), &|r, k| (r.uniform(k) - 0.5) * spread);
+                    add(format!("features.{i}.{part}.bias"), vec![shape[0]], &|r, k| 0.1 * r.normal(k));
+                }
+                channels = 2 * each;
+            }
             Layer::Pool(..) => {}
             Layer::Tap => {
                 add(format!("lin{taps}.model.1.weight"), vec![1, channels, 1, 1], &|r, k| r.uniform(k));
@@ -79,14 +91,25 @@ fn naive_distance(net: &Lpips, a: &Planes<f32>, b: &Planes<f32>) -> f64 {
         });
         Planes { channels: 3, height: p.height, width: p.width, data: data.collect() }
     };
-    let pool = |p: &Planes<f64>, side: usize, stride: usize| {
-        let mut out = Planes::new(p.channels, (p.height - side) / stride + 1, (p.width - side) / stride + 1);
+    let pool = |p: &Planes<f64>, side: usize, stride: usize, edge: Edge| {
+        let more = if edge == Edge::Cut { stride - 1 } else { 0 };
+        let size = |n: usize| (n - side + more) / stride + 1;
+        let mut out = Planes::new(p.channels, size(p.height), size(p.width));
         for i in 0..out.data.len() {
             let (c, y, x) = (i / out.pixels(), i % out.pixels() / out.width, i % out.width);
             out.data[i] = (0..side * side)
-                .map(|k| p.get(c, y * stride + k / side, x * stride + k % side))
+                .map(|k| (y * stride + k / side, x * stride + k % side))
+                .filter(|(y, x)| *y < p.height && *x < p.width)
+                .map(|(y, x)| p.get(c, y, x))
                 .fold(f64::NEG_INFINITY, f64::max);
         }
+        out
+    };
+    let fire = |[squeeze, narrow, wide]: &[Conv; 3], p: &Planes<f64>| {
+        let squeezed = naive_conv(squeeze, p);
+        let (mut out, rest) = (naive_conv(narrow, &squeezed), naive_conv(wide, &squeezed));
+        out.channels += rest.channels;
+        out.data.extend(rest.data);
         out
     };
     let (mut a, mut b) = (wide(a), wide(b));
@@ -94,7 +117,10 @@ fn naive_distance(net: &Lpips, a: &Planes<f32>, b: &Planes<f32>) -> f64 {
     for step in &net.steps {
         match step {
             Step::Conv(conv) => (a, b) = (naive_conv(conv, &a), naive_conv(conv, &b)),
-            Step::Pool { side, stride } => (a, b) = (pool(&a, *side, *stride), pool(&b, *side, *stride)),
+            Step::Fire(convs) => (a, b) = (fire(convs, &a), fire(convs, &b)),
+            Step::Pool { side, stride, edge } => {
+                (a, b) = (pool(&a, *side, *stride, *edge), pool(&b, *side, *stride, *edge));
+            }
             Step::Tap(w) => {
                 for y in 0..a.height {
                     for x in 0..a.width {
@@ -113,8 +139,9 @@ fn naive_distance(net: &Lpips, a: &Planes<f32>, b: &Planes<f32>) -> f64 {
 }
 
 #[test]
-fn both_networks_equal_the_definition_and_are_distances() {
-    for (net, height, width) in [(Net::Alex, 45, 61), (Net::Vgg, 17, 19)] {
+fn all_networks_equal_the_definition_and_are_distances() {
+    // The last size has windows of SqueezeNet's poolings that end outside of the image.
+    for (net, height, width) in [(Net::Alex, 45, 61), (Net::Vgg, 17, 19), (Net::Squeeze, 33, 29)] {
         let lpips = load(&weights(net)).expect("the names and shapes are right");
         assert_eq!(lpips.net(), net);
         let (a, b) = (image(height, width, 1), image(height, width, 2));
@@ -194,4 +221,32 @@ fn unfit_weights_are_named() {
         })
         .collect();
     assert!(load(&renamed).is_ok());
+}
+
+/// With the published weights, which are not in the repository: `SPLAT4D_LPIPS` names a folder with squeeze.safetensors and
+/// the example images of the `lpips` repository. Expected: computed in f64 by another program.
+#[test]
+fn squeezenet_equals_another_program_where_weights_are_given() {
+    use crate::capture::Rgb8;
+    use splat4d::format::safetensors::SafeTensors;
+    let Some(folder) = std::env::var_os("SPLAT4D_LPIPS").map(std::path::PathBuf::from) else {
+        return println!("skipped: SPLAT4D_LPIPS names no folder");
+    };
+    let bytes = std::fs::read(folder.join("squeeze.safetensors")).unwrap();
+    let file = SafeTensors::read(&bytes).unwrap();
+    let tensor = |name: &str| file.tensor(name).ok().map(|t| (t.shape().to_vec(), t.as_f32().unwrap().to_vec()));
+    let lpips = Lpips::load(tensor).unwrap();
+    assert_eq!(lpips.net(), Net::Squeeze);
+    let planes = |name: &str| {
+        let rgb = Rgb8::read(&folder.join(name)).unwrap();
+        let n = rgb.width * rgb.height;
+        let data = (0..3 * n).map(|i| f32::from(rgb.data[i % n * 3 + i / n]) / 255.0).collect();
+        Planes { channels: 3, height: rgb.height, width: rgb.width, data }
+    };
+    let truth = planes("ex_ref.png");
+    for (name, expected) in [("ex_p0.png", 0.711_047_6), ("ex_p1.png", 0.147_901_6)] {
+        let found = lpips.distance(&planes(name), &truth, InputScaling::Signed).unwrap();
+        println!("{name}: {found:.7}, expected {expected}");
+        assert!((found - expected).abs() < 1e-5, "{name}: {found}");
+    }
 }

@@ -48,7 +48,7 @@ pub const DIALECT: Dialect = Dialect {
     read: open,
     writer: Writer::Moment(|params, options, mut out| {
         let offset = (options.offset, options.world);
-        write_placed(params, offset, &mut out).map(|()| Warnings::default())
+        write_placed(params, offset, None, &mut out).map(|()| Warnings::default())
     }),
     world: true,
     fixed_axes: false,
@@ -62,6 +62,8 @@ const GEOMETRY_NAMES: [&str; 11] =
     ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity"];
 /// The base colour, coefficient 0 of red, green and blue.
 const DC_NAMES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
+/// Properties of velocities, scene units per second.
+const VELOCITY_NAMES: [&str; 3] = ["vx", "vy", "vz"];
 /// Written as zeros by all programs and read by none.
 const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
 /// Colours of point clouds.
@@ -218,12 +220,24 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
 /// Errors: a number is NaN or infinite; the sink's. Panics: the layer's SH coefficients are not 1, 4, 9 or 16 (degree
 /// 0-3).
 pub fn write(params: &Params, out: &mut impl Write) -> Result<()> {
-    write_placed(params, ([0.0; 3], false), out)
+    write_placed(params, ([0.0; 3], false), None, out)
 }
 
 /// The same of a scene with an offset: added in double precision where `world`, else a comment from which it is read
-/// back.
-pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mut impl Write) -> Result<()> {
+/// back. `velocities`, [N, 3] in scene units per second, become the properties `vx`, `vy`, `vz`.
+pub fn write_placed(
+    params: &Params,
+    (offset, world): ([f64; 3], bool),
+    velocities: Option<&Table>,
+    out: &mut impl Write,
+) -> Result<()> {
+    if let Some(moving) = velocities {
+        assert_eq!(moving.rows(), params.len(), "a velocity a Gaussian is needed");
+        if let Some((row, _)) = moving.first_non_finite() {
+            return Err(Error::input(format!("the velocity of Gaussian {row} is not finite"))
+                .remedy("Leave velocities out, or train the scene again"));
+        }
+    }
     params.check_finite()?;
     let world = world && offset != [0.0; 3];
     let width = params[SH].width();
@@ -234,6 +248,7 @@ pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mu
     let rest: Vec<String> = (0..f_rest).map(|i| format!("f_rest_{i}")).collect();
     let names = ["x", "y", "z"].into_iter().chain(NORMAL_NAMES).chain(DC_NAMES).chain(rest.iter().map(String::as_str));
     let names = names.chain(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
+    let names = names.chain(VELOCITY_NAMES.into_iter().filter(|_| velocities.is_some()));
     let mut text = "ply\nformat binary_little_endian 1.0\n".to_owned();
     if !world && offset != [0.0; 3] {
         text.push_str(&format!("comment {OFFSET} {} {} {}\n", offset[0], offset[1], offset[2]));
@@ -264,6 +279,7 @@ pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mu
             }
             put(g[10]);
             g[7..10].iter().chain(&g[3..7]).for_each(|&x| put(x));
+            velocities.iter().flat_map(|v| v.read::<3>(row, 0)).for_each(put);
         }
         write(&buffer)?;
     }

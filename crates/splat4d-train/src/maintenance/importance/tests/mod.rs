@@ -196,18 +196,19 @@ fn pruning_ranks_all_layers_together_and_keeps_one_gaussian() {
 
 /// The rows that a lifespan leaves draw the very image of all rows: what it hides is below the blend's cut-off.
 #[test]
-fn interval_buckets_return_every_active_row() {
+fn active_rows_render_the_image_of_all_rows() {
     let (s, made) = (scene(400), made());
-    let buckets: Vec<_> = s.layers.iter().map(|l| l.buckets(s.clip, 7)).collect();
     let mut hidden = 0;
     for i in (0..made.len()).step_by(4) {
         let t = made.time(i);
         let draw = |all: bool| {
             let mut tapes: Vec<LayerTape<f32>> = s.layers.iter().map(|_| LayerTape::default()).collect();
-            for ((layer, buckets), tape) in s.layers.iter().zip(&buckets).zip(&mut tapes) {
-                let mut ids = Vec::new();
-                buckets.active(t, &mut ids);
-                tape.request(Space::Gaussians, if all { Rows::All } else { Rows::Some(&ids) }, t);
+            for (layer, tape) in s.layers.iter().zip(&mut tapes) {
+                if all {
+                    tape.request(Space::Gaussians, Rows::All, t);
+                } else {
+                    tape.request_active(layer, t);
+                }
                 layer.at(&splat4d::motion::Cache::default(), tape);
             }
             let parts: Vec<Part<'_, f32>> = s.layers.iter().zip(&tapes).map(|(l, tape)| l.part(tape)).collect();
