@@ -10,6 +10,7 @@ mod surface;
 use crate::events::Listener;
 use crate::exporting::Frames;
 use crate::files::{self, either, grouped};
+use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use depth::{columns, in_grid, in_world, inverses, map, views};
@@ -104,6 +105,8 @@ pub struct Mesher<'a> {
     source: &'a Source,
     player: Player<'a>,
     cameras: Vec<Camera>,
+    /// Depth is that of centres, as the depth loss measures it.
+    centers: bool,
     options: MeshOptions,
     grid_from_world: [[f64; 3]; 3],
 }
@@ -125,13 +128,17 @@ impl<'a> Mesher<'a> {
         }
         let grid_from_world = rotation_between(source.scene.up, GRID_UP).unwrap_or(IDENTITY);
         let player = Player::of_scene(&source.scene);
-        Ok(Self { source, player, cameras, options: *options, grid_from_world })
+        let centers = source.run.as_ref().is_some_and(trained_with_depth);
+        Ok(Self { source, player, cameras, centers, options: *options, grid_from_world })
     }
 
     /// Where the surfaces are seen from, in words.
     fn seen_from(&self) -> String {
         match self.cameras.len() {
             0 => "the file has no cameras: surfaces are those that views around the scene see".into(),
+            n if self.centers => {
+                format!("surfaces as {n} camera poses see them, with the depth that depth maps trained")
+            }
             n => format!("surfaces as {n} camera poses see them"),
         }
     }
@@ -159,7 +166,7 @@ impl<'a> Mesher<'a> {
         let (mut shell, mut maps) = (Shell::new(options.voxel, bounds)?, Vec::new());
         for camera in views(&in_grid, bounds, options.voxel) {
             let world = in_world(&camera, &turn);
-            let planes = columns(&inverses, &world);
+            let planes = columns(&inverses, &world, self.centers);
             backend.render(&Shot { extra: Some(&planes), ..Shot::new(&splats, &world, [0.0; 3]) }, &mut image)?;
             maps.push(map(&image, camera, fusion::BAND * options.voxel));
             shell.add(&maps[maps.len() - 1])?;
@@ -179,6 +186,13 @@ impl<'a> Mesher<'a> {
         mesh.rotate(&se3::transpose(&turn));
         Ok(mesh)
     }
+}
+
+/// Whether a run was trained with depth maps: its splats are where the mean depth of their centres is right.
+fn trained_with_depth(run: &Run) -> bool {
+    run.open_capture().is_ok_and(|(capture, recipe)| {
+        recipe.loss.depth > 0.0 && capture.train.iter().any(|&i| capture.frames[i].depth.is_some())
+    })
 }
 
 const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];

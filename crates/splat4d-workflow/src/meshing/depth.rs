@@ -130,14 +130,14 @@ fn inverse([a, b, c, d, e, f]: [f64; 6]) -> [f64; 6] {
     minors.map(|m| m / det)
 }
 
-/// Depth of every splat as a linear function of the pixel's distance from the principal point: [splats, 3], a, g_u, g_v.
-/// `camera` is in the world.
-pub(super) fn columns(inverses: &[([f64; 3], [f64; 6])], camera: &Camera) -> Table<f32> {
+/// Depth of every splat as a linear function of the pixel's distance from the principal point: [splats, 3], a, g_u, g_v;
+/// with `centers` [splats, 4], also the depth of its centre. `camera` is in the world.
+pub(super) fn columns(inverses: &[([f64; 3], [f64; 6])], camera: &Camera, centers: bool) -> Table<f32> {
     let (center, pose, k) = (camera.center(), &camera.cam_from_world, &camera.intrinsics);
-    let row = |(mean, p): &([f64; 3], [f64; 6])| -> [f32; 3] {
+    let row = |(mean, p): &([f64; 3], [f64; 6])| -> [f32; 4] {
         let m = pose.apply(*mean);
         if m[2].is_nan() || m[2] <= camera.near {
-            return [0.0; 3];
+            return [0.0; 4];
         }
         // Along a ray of direction d (z = 1) the density is largest at t = dᵀPm / dᵀPd.
         let v = sub(*mean, center);
@@ -153,15 +153,18 @@ pub(super) fn columns(inverses: &[([f64; 3], [f64; 6])], camera: &Camera) -> Tab
             if slope.is_finite() { slope.clamp(-STEEPEST * m[2], STEEPEST * m[2]) } else { 0.0 }
         };
         let (x, y) = (slope(0), slope(1));
-        [(m[2] - (x * m[0] + y * m[1]) / m[2]) as f32, (x / k.fx) as f32, (y / k.fy) as f32]
+        [(m[2] - (x * m[0] + y * m[1]) / m[2]) as f32, (x / k.fx) as f32, (y / k.fy) as f32, m[2] as f32]
     };
-    let rows: Vec<[f32; 3]> = inverses.par_iter().map(row).collect();
-    let mut out = Table::new(&[("plane", 3)], rows.len());
-    rows.iter().enumerate().for_each(|(i, values)| out.write(i, 0, *values));
+    let rows: Vec<[f32; 4]> = inverses.par_iter().map(row).collect();
+    let width = if centers { 4 } else { 3 };
+    let mut out = Table::new(&[("plane", width)], rows.len());
+    for (i, values) in rows.iter().enumerate() {
+        values[..width].iter().enumerate().for_each(|(column, value)| out.set(i, column, *value));
+    }
     out
 }
 
-/// What the rendered image shows. Pixels that disagree by more than `jump` with their neighbours on both sides blend
+/// What the image rendered with these columns shows. Pixels that disagree by more than `jump` with their neighbours on both sides blend
 /// what is in front with what is behind, and are unknown.
 pub(super) fn map(image: &Image, camera: Camera, jump: f64) -> Map {
     let (width, height, k) = (camera.width, camera.height, camera.intrinsics);
@@ -171,7 +174,10 @@ pub(super) fn map(image: &Image, camera: Camera, jump: f64) -> Map {
         let p = y * width + x;
         let a = alpha[p];
         let [z, u, v] = [0, 1, 2].map(|c| f64::from(extra.plane(c)[p] / a));
-        let depth = z + u * (x as f64 + 0.5 - k.cx) + v * (y as f64 + 0.5 - k.cy);
+        let depth = match extra.channels {
+            3 => z + u * (x as f64 + 0.5 - k.cx) + v * (y as f64 + 0.5 - k.cy),
+            _ => f64::from(extra.plane(3)[p] / a),
+        };
         (a >= SURFACE_ALPHA && depth > camera.near && depth.is_finite()).then_some([depth, u, v])
     };
     let differs = |[depth, u, v]: [f64; 3], [x, y]: [usize; 2], [dx, dy]: [isize; 2]| {

@@ -11,7 +11,7 @@ pub(super) const SIDE: usize = 8;
 /// Voxels of a block.
 pub(super) const VOXELS: usize = SIDE * SIDE * SIDE;
 /// Voxels from a surface to where distances are cut off.
-pub(super) const BAND: f64 = 4.0;
+pub(super) const BAND: f64 = 3.0;
 /// Most blocks, 4 KiB each.
 pub(super) const MOST_BLOCKS: usize = 150_000;
 /// Weight of a ray that passes a voxel, where one that meets a surface at a right angle has 1.
