@@ -169,7 +169,7 @@ fn a_run_with_a_head_is_baked_exported_and_converted() {
     for args in [
         &["bake", "run", "-o", "a.s4d"][..],
         &["convert", "run", "a.splatv"],
-        &["convert", "run", "f_%d.spz", "--frames"],
+        &["convert", "run", "frames/f_%d.spz", "--frames"],
         &["export", "run", "-o", "a.ply", "--velocities"],
         &["export", "run", "-o", "a.html", "--html"],
     ] {
