@@ -37,6 +37,7 @@ const GUIDES = [
   ['docs/file-size', 'Limit the file size'],
   ['docs/compression', 'Compress'],
   ['docs/engines', 'Hand over to another program'],
+  ['docs/meshes', 'Write meshes'],
   ['docs/edit', 'Edit'],
   ['docs/labels', 'Label'],
   ['docs/track-points', 'Track points'],

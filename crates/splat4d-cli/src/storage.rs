@@ -1,12 +1,9 @@
 //! Addresses of object storage, and the option that goes with them.
 
-#[cfg(not(feature = "storage"))]
-use splat4d_workflow::parts::left_out;
 use std::path::{Path, PathBuf};
 
 /// The place of local copies.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Object storage")]
 pub(crate) struct StorageArgs {
     /// Folder for local copies of s3://BUCKET/FOLDER addresses [default: splat4d in the user's cache folder]
     #[arg(long, value_name = "FOLDER")]
@@ -21,7 +18,10 @@ pub(crate) fn is_address(path: &Path) -> bool {
 /// Errors: this build has no object storage.
 #[cfg(not(feature = "storage"))]
 pub(crate) fn refused<T>() -> anyhow::Result<T> {
-    Err(left_out("object storage (s3://)", "storage").into())
+    let what = "object storage (s3://) is left out of this build of splat4d";
+    Err(splat4d::Error::new(splat4d::ErrorKind::Unsupported, what)
+        .remedy("Use a release archive, or build it: cargo install splat4d --features storage")
+        .into())
 }
 
 #[cfg(feature = "storage")]

@@ -10,6 +10,8 @@ const FOV_DEFAULT = 45;
 export const FOV_RANGE = [5, 120];
 /** In a window taller than the scene was seen, the first view shows this share of its width, so that less of what no camera saw is shown. */
 const TALL_SHARE = 0.75;
+/** Where the first view is examined for what the capture's cameras saw: shares of the distance to the target, and tangents from its axis. */
+const SEEN_AT = [0.5, 0.7, 1, 1.5, 2.2], SEEN_ACROSS = [-0.25, 0, 0.25], SEEN_STEP = 0.02, SEEN_MOST = 2;
 /** Below this a cross product has no direction: eye, target and up are on one line. */
 const PARALLEL = 1e-9;
 
@@ -97,6 +99,10 @@ export class Camera {
   lens = null;
   /** 1: a first view, which comes nearer in a tall window, until the viewer moves; 0: not; between, in transition. */
   first = 0;
+  /** Of a first view: the highest and lowest row that a camera saw, tangents from its axis, down positive; null: unknown. */
+  seen = null;
+  /** How far the axis is above the middle of a tall window, tangent; set when a first view is moved. */
+  lift = 0;
 
   get right() { return quatTurn(this.quat, [1, 0, 0]); }
   get down() { return quatTurn(this.quat, [0, 1, 0]); }
@@ -108,6 +114,7 @@ export class Camera {
   set({ position, quat, target, distance, fov, up }) {
     this.lens = null;
     this.first = 0;
+    this.lift = 0;
     if (up && norm(up) > PARALLEL) this.up = normalize(up);
     if (position) this.position = position.slice();
     if (quat) this.quat = quatNormal(quat);
@@ -138,6 +145,9 @@ export class Camera {
     c.position = add(target, c.forward, -c.distance);
     c.fov = lerp(a.fov, b.fov, u);
     c.first = lerp(a.first, b.first, u);
+    // The window that these are for is not known here: both are kept, and `view` weighs the first one.
+    c.seen = a.first ? a.seen : b.seen;
+    c.lift = lerp(a.lift, b.lift, u);
     return c;
   }
 
@@ -153,11 +163,21 @@ export class Camera {
     if (this.lens) {
       // All of the dataset camera's image is shown, centred, with more of the world where the window is wider.
       const l = this.lens, k = Math.min(width / l.width, height / l.height) * this.#nearer(width / l.width, height / l.height);
-      return { ...view, fx: l.fx * k, fy: l.fy * k,
-        cx: width / 2 + (l.cx - l.width / 2) * k, cy: height / 2 + (l.cy - l.height / 2) * k };
+      const cy = height / 2 + (l.cy - l.height / 2) * k - this.#lifted(width, height, l.fy * k) * l.fy * k;
+      return { ...view, fx: l.fx * k, fy: l.fy * k, cx: width / 2 + (l.cx - l.width / 2) * k, cy };
     }
     const f = Math.min(width, height) / 2 / Math.tan(this.fov * DEGREE / 2) * this.#nearer(width, height);
-    return { ...view, fx: f, fy: f, cx: width / 2, cy: height / 2 };
+    return { ...view, fx: f, fy: f, cx: width / 2, cy: height / 2 - this.#lifted(width, height, f) * f };
+  }
+
+  /** How far the axis is above the middle of the window, tangent: a tall one shows as little as possible of what no camera saw. */
+  #lifted(width, height, f) {
+    if (height <= width) return 0;
+    if (!this.first || !this.seen) return this.lift;
+    const half = height / 2 / f, [top, bottom] = this.seen;
+    const first = top + half > bottom - half ? (top + bottom) / 2 : clamp(0, top + half, bottom - half);
+    // The subject stays in the middle half.
+    return lerp(this.lift, clamp(first, -half / 2, half / 2), this.first);
   }
 
   /** How much larger a first view is where the window is taller than wide, each measured in what was seen. */
@@ -167,6 +187,7 @@ export class Camera {
   loosen(width, height) {
     if (!this.lens && !this.first) return;
     const { fy } = this.view(width, height);
+    this.lift = this.#lifted(width, height, fy);
     this.lens = null;
     this.first = 0;
     this.fov = clamp(2 * Math.atan(Math.min(width, height) / 2 / fy) / DEGREE, ...FOV_RANGE);
@@ -186,7 +207,32 @@ export function bounds(meta) {
 }
 
 /** The first view: the file's own, else its first dataset camera, else the whole box from the front. */
-export const firstCamera = meta => Object.assign(viewpoint(meta), { first: 1 });
+export const firstCamera = meta => {
+  const camera = viewpoint(meta);
+  return Object.assign(camera, { first: 1, seen: seenRows(camera, meta?.cameras ?? []) });
+};
+
+/** The highest and lowest row of a view in which a camera of the capture saw something, tangents from its axis; null: there are no two cameras. */
+function seenRows(camera, cameras) {
+  if (cameras.length < 2) return null;
+  const { position, right, down, forward, distance } = camera;
+  const sees = (c, p) => {
+    const m = c.world_from_camera, d = [p[0] - m[3], p[1] - m[7], p[2] - m[11]];
+    const [x, y, z] = [0, 1, 2].map(k => m[k] * d[0] + m[4 + k] * d[1] + m[8 + k] * d[2]);
+    const u = c.fx * x / z + c.cx, v = c.fy * y / z + c.cy;
+    return z > 0 && u >= 0 && v >= 0 && u <= c.width && v <= c.height;
+  };
+  const isSeen = row => SEEN_AT.some(share => SEEN_ACROSS.every(x => {
+    const ray = add(add(forward, right, x), down, row), p = add(position, ray, share * distance);
+    return cameras.some(c => sees(c, p));
+  }));
+  const end = sign => {
+    let row = 0;
+    while (Math.abs(row) < SEEN_MOST && isSeen(row + sign * SEEN_STEP)) row += sign * SEEN_STEP;
+    return row;
+  };
+  return [end(-1), end(1)];
+}
 
 function viewpoint(meta) {
   const camera = new Camera();

@@ -13,6 +13,7 @@ use crate::files::{self, either, grouped};
 use crate::sequence::{self, Pattern};
 use crate::source::{Source, not_empty};
 use depth::{columns, in_grid, in_world, inverses, map, views};
+use fusion::Shell;
 pub use mesh::Mesh;
 use rayon::prelude::*;
 use serde_json::json;
@@ -155,14 +156,15 @@ impl<'a> Mesher<'a> {
         let config = RenderConfig { antialias: crate::draw::antialias(smooth), ..RenderConfig::default() };
         let (mut backend, mut image) = (device::cpu(config), Image::default());
         let inverses = inverses(&splats);
-        let mut maps = Vec::new();
+        let (mut shell, mut maps) = (Shell::new(options.voxel, bounds)?, Vec::new());
         for camera in views(&in_grid, bounds, options.voxel) {
             let world = in_world(&camera, &turn);
             let planes = columns(&inverses, &world);
             backend.render(&Shot { extra: Some(&planes), ..Shot::new(&splats, &world, [0.0; 3]) }, &mut image)?;
             maps.push(map(&image, camera, fusion::BAND * options.voxel));
+            shell.add(&maps[maps.len() - 1])?;
         }
-        let mut grid = fusion::fuse(&maps, options.voxel, bounds)?;
+        let mut grid = shell.fuse(&maps);
         drop(maps);
         if options.watertight || options.collision {
             solid::close(&mut grid, options.collision)?;

@@ -12,8 +12,7 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d join runs/concert             after `train concert -o runs/concert --chunk I` for every I
-  splat4d join runs/concert --no-eval   only the scene and the file";
+  splat4d join runs/concert   after `train concert -o runs/concert --chunk I` for every I";
 
 /// Join the chunks of a long capture into one scene and file, measure and report
 #[derive(Debug, clap::Args)]

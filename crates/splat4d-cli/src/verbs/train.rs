@@ -31,9 +31,8 @@ Examples:
   splat4d train my-take --view                      watch it learn in the browser
   splat4d train my-take --motion still              a static scene: checks the calibration
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
-  splat4d train my-take --hold-out camera=0,10      measure on these cameras
-  splat4d train my-take --observe 0.8               keep the last fifth for `predict`
   splat4d train concert -o runs/concert --chunk-frames 60    a long capture in chunks
+  splat4d train s3://takes/concert -o s3://takes/run --chunk all    workers on object storage
   splat4d train my-take --device auto               on a GPU, if there is one
   splat4d train --resume runs/first                 continue exactly
 
@@ -61,7 +60,7 @@ const IMPORTANT: [&str; 12] = [
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub struct Args {
-    /// The capture: a folder, or its marker file
+    /// The capture: a folder, or its marker file; or s3://BUCKET/FOLDER
     #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source", "help_knobs"])]
     capture: Option<PathBuf>,
     /// Output folder [default: runs/NAME, or runs/NAME-2 ... if it exists]
@@ -125,6 +124,8 @@ pub struct Args {
     /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
     #[arg(long, value_name = "PART", help_heading = "Long captures", requires = "output", conflicts_with = "force")]
     chunk: Option<ChunkSelection>,
+    #[command(flatten, next_help_heading = "Long captures")]
+    storage: StorageArgs,
     /// Memory for decoded images [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     image_memory: Option<u64>,
@@ -142,8 +143,6 @@ pub struct Args {
     view: bool,
     #[command(flatten)]
     place: Place,
-    #[command(flatten)]
-    storage: StorageArgs,
     /// Only train and bake; skip evaluation, film and report
     #[arg(long, help_heading = "Evaluation")]
     no_eval: bool,

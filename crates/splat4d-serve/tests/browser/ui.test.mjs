@@ -6,6 +6,7 @@ import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { after, before, test } from 'node:test';
 import { launch } from './browser.mjs';
+import { firstCamera } from '../../player/camera.js';
 import { Cost, Flight, Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
@@ -415,6 +416,31 @@ test('an upright phone shows the subject larger, with duration and speed; the hi
   // The third camera of the capture is shown whole.
   assert.ok(await ask(e => { e.player.controls.swing = false; e.player.view(2); return e.player.camera.view(390, 844).fx / 900 * 800 <= 390.01; }));
   await done();
+});
+
+test('the first view of a tall window shows as little as possible of what no camera saw', () => {
+  /** A camera at this angle of an arc that looks down at the origin, its image at most as high as wide. */
+  const camera = angle => {
+    const [s, c] = [Math.sin(angle), Math.cos(angle)], tilt = 0.26, [a, b] = [Math.sin(tilt), Math.cos(tilt)];
+    const world_from_camera = [c, s * a, -s * b, 6 * s * b, 0, -b, -a, 6 * a, -s, c * a, -c * b, 6 * c * b];
+    return { world_from_camera, width: 400, height: 300, fx: 300, fy: 300, cx: 200, cy: 150 };
+  };
+  const meta = { up: [0, 1, 0], box: [[-5, -1, -5], [5, 4, 5]], cameras: [-0.9, -0.6, -0.3, 0, 0.3, 0.6, 0.9].map(camera),
+    view: { position: [0, 1.6, 5.8], target: [0, 0, 0], fov_y: 53 } };
+  const first = firstCamera(meta), [width, height] = [390, 844], view = first.view(width, height);
+  assert.ok(view.cy < height / 2 - 40, `the axis is above the middle: ${view.cy}`);
+  const [top, bottom] = first.seen, missing = { above: top + view.cy / view.fy, below: (height - view.cy) / view.fy - bottom };
+  assert.ok(bottom - top > 1 && missing.above < 0.17, JSON.stringify({ missing, seen: first.seen }));
+  near(missing.above, missing.below);
+  near(first.view(844, 390).cy, 195);
+  near(firstCamera({ ...meta, cameras: [] }).view(width, height).cy, height / 2);
+  first.loosen(width, height);
+  near(first.view(width, height).cy, view.cy, 1e-6);
+  near(first.view(844, 390).cy, 195);
+  // A camera that looks elsewhere gives no information about this view.
+  const away = firstCamera({ ...meta, view: { position: [0, 1.6, 5.8], target: [0, 1.6, 20] } }).view(width, height);
+  assert.ok(away.cy >= height / 4 && away.cy <= 3 * height / 4, `${away.cy}`);
+  near(first.set({ position: [0, 0, 4] }).view(width, height).cy, height / 2);
 });
 
 test('a page without permission to edit loads no editor', options, async () => {

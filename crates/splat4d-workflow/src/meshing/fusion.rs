@@ -121,24 +121,38 @@ fn touched(map: &Map, voxel: f64, [low, high]: [[f64; 3]; 2]) -> Vec<u64> {
     all
 }
 
-/// Averages the surfaces of all maps that are in the box (low and high corner).
-///
-/// Errors: more blocks than memory should hold; a box of more voxels than coordinates can count.
-pub(super) fn fuse(maps: &[Map], voxel: f64, bounds: [[f64; 3]; 2]) -> Result<Grid> {
-    let reach = bounds.iter().flatten().fold(0.0, |m: f64, x| m.max(x.abs())) / (voxel * SIDE as f64);
-    if reach >= f64::from(MOST_COORDINATE - 2) {
-        check_blocks(usize::MAX, voxel)?;
+/// Blocks around the surfaces that maps show, found one map at a time: voxels that are too small are noticed early.
+pub(super) struct Shell {
+    voxel: f64,
+    bounds: [[f64; 3]; 2],
+    /// Packed, sorted.
+    keys: Vec<u64>,
+}
+
+impl Shell {
+    /// Of surfaces in a box (low and high corner). Errors: a box of more voxels than coordinates can count.
+    pub(super) fn new(voxel: f64, bounds: [[f64; 3]; 2]) -> Result<Self> {
+        let reach = bounds.iter().flatten().fold(0.0, |m: f64, x| m.max(x.abs())) / (voxel * SIDE as f64);
+        if reach >= f64::from(MOST_COORDINATE - 2) {
+            check_blocks(usize::MAX, voxel)?;
+        }
+        Ok(Self { voxel, bounds, keys: Vec::new() })
     }
-    let mut keys: Vec<u64> = Vec::new();
-    for map in maps {
-        keys.extend(touched(map, voxel, bounds));
-        keys.par_sort_unstable();
-        keys.dedup();
-        check_blocks(keys.len(), voxel)?;
+
+    /// Adds the surfaces of a map. Errors: more blocks than memory should hold.
+    pub(super) fn add(&mut self, map: &Map) -> Result<()> {
+        self.keys.extend(touched(map, self.voxel, self.bounds));
+        self.keys.par_sort_unstable();
+        self.keys.dedup();
+        check_blocks(self.keys.len(), self.voxel)
     }
-    let keys: Vec<[i32; 3]> = keys.into_iter().map(unpack).collect();
-    let blocks = keys.par_iter().map(|key| integrate(*key, maps, voxel)).collect();
-    Ok(Grid { voxel, keys, blocks })
+
+    /// Averages the surfaces of all maps.
+    pub(super) fn fuse(self, maps: &[Map]) -> Grid {
+        let keys: Vec<[i32; 3]> = self.keys.into_iter().map(unpack).collect();
+        let blocks = keys.par_iter().map(|key| integrate(*key, maps, self.voxel)).collect();
+        Grid { voxel: self.voxel, keys, blocks }
+    }
 }
 
 /// What all maps show of a block.

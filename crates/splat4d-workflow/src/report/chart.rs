@@ -338,7 +338,8 @@ mod tests {
 
     /// Colours of a style sheet, sRGB: those on a light page, then those on a dark one.
     fn palettes(sheet: &str) -> [Vec<[f64; 3]>; 2] {
-        let mut found = sheet.split("--c").skip(1).map(|rest| {
+        let numbered = |rest: &&str| rest.starts_with(|c: char| c.is_ascii_digit()) && rest[1..].starts_with(':');
+        let mut found = sheet.split("--c").skip(1).filter(numbered).map(|rest| {
             let hex = rest.split('#').nth(1).unwrap();
             [0, 2, 4].map(|k| f64::from(u8::from_str_radix(&hex[k..k + 2], 16).unwrap()) / 255.0)
         });

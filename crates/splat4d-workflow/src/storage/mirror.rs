@@ -101,7 +101,7 @@ impl<'a> Mirror<'a> {
         Ok(out)
     }
 
-    /// Downloads the wanted objects that differ. `report`: done, of all.
+    /// Downloads those of some objects that differ. `report`: done, of all.
     ///
     /// Errors: those of the storage; a file cannot be written; `stop` is set.
     pub(super) fn fetch(

@@ -170,11 +170,12 @@ impl Storage {
         for slot in 0..SLOTS {
             let folder = self.local.join(format!("{of}-{slot}"));
             crate::files::make_folder(&folder)?;
-            // Another worker on this machine.
-            if Owner::holder(&folder).is_some() {
-                continue;
-            }
-            let owner = Owner::of(&folder, COMMAND)?;
+            let owner = match Owner::of(&folder, COMMAND) {
+                Ok(owner) => owner,
+                // Another worker on this machine.
+                Err(_) if Owner::holder(&folder).is_some() => continue,
+                Err(error) => return Err(error),
+            };
             // As paths in the files of a run are written.
             let folder = std::fs::canonicalize(&folder).unwrap_or(folder);
             return Ok(Place { files: folder.join(address.name()), folder, owner });

@@ -9,8 +9,8 @@ use std::ops::Range;
 const FILES: [&str; 6] = ["images", "masks", "depth", "flow", "labels", "features"];
 
 /// Files of frames outside of `frames`, as a `capture.json` of fixed cameras names them; empty where the capture can
-/// only be read as a whole, as in `capture/own.rs`. A frame more on each side is kept.
-pub(super) fn not_needed(capture: &Value, recipe: &Recipe, frames: &[Range<usize>]) -> BTreeSet<String> {
+/// only be read as a whole, as in `capture/own.rs`. A frame more on each side is kept. `most`: files of the capture.
+pub(super) fn not_needed(capture: &Value, recipe: &Recipe, frames: &[Range<usize>], most: usize) -> BTreeSet<String> {
     let (mut others, mut kept) = (BTreeSet::new(), BTreeSet::new());
     let rule = recipe.get("capture.hold_out").and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default();
     let stated = &capture["hold_out"];
@@ -31,6 +31,10 @@ pub(super) fn not_needed(capture: &Value, recipe: &Recipe, frames: &[Range<usize
         let (Some(start), Some(count), false) = (start, own("frames").as_u64(), moves) else {
             return BTreeSet::new();
         };
+        // More frames than files: the reader reports it.
+        if count > most as u64 {
+            return BTreeSet::new();
+        }
         for name in FILES.iter().filter_map(|key| Names::read(&camera[*key])) {
             for i in 0..count as usize {
                 let Some(file) = name.of(start as usize, i) else { break };
@@ -81,14 +85,14 @@ mod tests {
         let camera = |name: &str| json!({"name": name, "world_to_camera": pose, "images": format!("{name}/%03d.png"), "masks": format!("m/{name}%d.png")});
         let capture = json!({"frames": 10, "start": 5, "cameras": [camera("a"), camera("b")]});
         let recipe = Recipe::default();
-        let found = not_needed(&capture, &recipe, &[0..2, 6..8]);
+        let found = not_needed(&capture, &recipe, &[0..2, 6..8], 40);
         let frames: Vec<&str> = found.iter().filter_map(|f| f.strip_prefix("a/")).collect();
         assert_eq!(frames, ["008.png", "009.png", "014.png"], "frames 3, 4 and 9");
         assert!(found.contains("m/b8.png") && found.len() == 12);
-        let mut whole = |change: &dyn Fn(&mut Value)| {
+        let whole = |change: &dyn Fn(&mut Value)| {
             let mut capture = capture.clone();
             change(&mut capture);
-            not_needed(&capture, &recipe, &[0..2]).is_empty()
+            not_needed(&capture, &recipe, &[0..1, 1..2], 40).is_empty()
         };
         assert!(whole(&|c| c["cameras"][1]["world_to_camera"] = json!([pose, pose])), "a camera moves");
         assert!(whole(&|c| c["frames"] = Value::Null), "the number of frames is that of the files");
@@ -97,6 +101,7 @@ mod tests {
         assert!(whole(&|c| *c = json!("no capture")));
         let mut every = Recipe::default();
         every.set("hold_out=every=8").unwrap();
-        assert!(not_needed(&capture, &every, &[0..2]).is_empty());
+        assert!(not_needed(&capture, &every, &[0..1, 1..2], 40).is_empty());
+        assert!(whole(&|c| c["frames"] = json!(u64::MAX)), "no such frames");
     }
 }

@@ -31,8 +31,8 @@ const UPLOAD: u64 = 5 << 30;
 /// Region where none is given.
 const REGION: &str = "us-east-1";
 
-/// Access to a storage, as programs of AWS read it from the environment.
-#[derive(Clone, Debug, Default)]
+/// Access to a storage, as programs of AWS read it from the environment. It holds secrets and is not printed.
+#[derive(Clone, Default)]
 pub struct Access {
     /// `AWS_ACCESS_KEY_ID`.
     pub key: Option<String>,
@@ -147,7 +147,11 @@ impl Bucket {
         if again {
             return Attempt::Failed(said);
         }
-        let region = response.headers().get("x-amz-bucket-region").and_then(|v| v.to_str().ok()).unwrap_or("...");
+        let stated = response.headers().get("x-amz-bucket-region").and_then(|v| v.to_str().ok());
+        let region = stated.unwrap_or(match between(&text, "<Region>", "</Region>") {
+            "" => "...",
+            region => region,
+        });
         let (what, remedy) = match (code, status) {
             ("NoSuchBucket", _) => ("there is no such bucket".into(), "Create it, or correct the address".into()),
             ("InvalidAccessKeyId" | "SignatureDoesNotMatch" | "ExpiredToken" | "InvalidToken", _) => (
@@ -161,7 +165,10 @@ impl Bucket {
                 format!("access is denied ({said})"),
                 "The credentials need the rights to list, read and write below this address; to delete as well".into(),
             ),
-            (_, s) if s.is_redirection() => {
+            (code, s)
+                if s.is_redirection()
+                    || ["AuthorizationHeaderMalformed", "AuthorizationQueryParametersError"].contains(&code) =>
+            {
                 ("the bucket is in another region".into(), format!("Set AWS_REGION={region}"))
             }
             _ => (format!("the object storage refuses a request ({said})"), "Check the address and AWS_ENDPOINT_URL".into()),

@@ -31,7 +31,7 @@ struct Memory {
 
 impl Memory {
     fn put(&self, key: &str, bytes: &[u8]) -> String {
-        let etag = format!("\"{}\"", self.count.fetch_add(1, Ordering::Relaxed));
+        let etag = format!("\"e{}\"", self.count.fetch_add(1, Ordering::Relaxed));
         let now = self.clock.load(Ordering::Relaxed);
         self.objects.lock().unwrap().insert(key.into(), (bytes.to_vec(), etag.clone(), now));
         etag
@@ -90,7 +90,7 @@ impl Store for Memory {
         if !met {
             return Ok(None);
         }
-        let etag = format!("\"{}\"", self.count.fetch_add(1, Ordering::Relaxed));
+        let etag = format!("\"e{}\"", self.count.fetch_add(1, Ordering::Relaxed));
         objects.insert(key.into(), (bytes.to_vec(), etag.clone(), self.clock.load(Ordering::Relaxed)));
         Ok(Some(etag))
     }
@@ -230,6 +230,9 @@ fn workers_without_a_shared_folder_make_the_same_scene() {
     assert!(objects.contains_key("runs/run/scene.s4d"));
     let info = String::from_utf8(objects["runs/run/run.json"].0.clone()).unwrap();
     assert!(info.contains(CAPTURE) && !info.contains("machine"), "no path of a machine is uploaded: {info}");
+    let infos = objects.iter().filter(|(key, _)| key.ends_with("run.json"));
+    assert_eq!(infos.clone().count(), 4);
+    assert!(infos.map(|(_, o)| String::from_utf8_lossy(&o.0)).all(|text| !text.contains("machine")));
     drop(objects);
     assert!(memory.keys("claims").is_empty(), "all claims were given back");
     assert_eq!(state(&machine(9))["finished"], true);
@@ -270,7 +273,13 @@ fn a_killed_worker_loses_what_it_had_not_uploaded() {
         }
     };
     assert!(work(&machine(0), ChunkSelection::One(Part::Shared), &listener, &stop).unwrap().interrupted);
-    assert!(memory.keys("runs/run/chunks/shared/checkpoints/").len() == 1 && memory.keys("claims").is_empty());
+    let newest = || {
+        let names = memory.keys("runs/run/chunks/shared/checkpoints/");
+        let step = |name: &String| name.rsplit('/').next()?.strip_suffix(".safetensors")?.parse::<usize>().ok();
+        names.iter().filter_map(step).max()
+    };
+    let step = newest().expect("its checkpoint is uploaded");
+    assert!(step >= 10 && memory.keys("claims").is_empty(), "{step}");
     // As if that worker had been killed: its claim stays, without a heartbeat.
     let key = "runs/run/.splat4d/claims/shared";
     memory.put(key, br#"{"id":"dead","worker":"process 7 on far","beat":3}"#);
@@ -290,7 +299,7 @@ fn a_killed_worker_loses_what_it_had_not_uploaded() {
         }
     };
     work(&machine(1), ChunkSelection::One(Part::Shared), &listener, &AtomicBool::new(false)).unwrap();
-    assert_eq!(*first.lock().unwrap(), Some(10), "it goes on from the uploaded checkpoint");
+    assert_eq!(*first.lock().unwrap(), Some(step), "it goes on from the uploaded checkpoint");
     assert!(memory.objects.lock().unwrap()["runs/run/chunks/shared/still.safetensors"].0 == expected[1]);
     // The storage is gone in the middle.
     let listener = |event: &Event<'_>| {

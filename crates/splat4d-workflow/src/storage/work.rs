@@ -16,6 +16,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::output::{OutputFolder, STATE, write_atomically};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::{Chunked, Part, look_ahead};
+use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -86,14 +87,16 @@ pub fn train(
 /// The capture of a training.
 enum Source {
     Local(PathBuf),
-    Remote { store: Box<dyn Store>, address: Address, place: Place },
+    Remote { store: Box<dyn Store>, address: Address, place: Box<Place> },
 }
 
 impl Source {
     fn of(capture: &Path, storage: &Storage) -> Result<Self> {
         Ok(match Address::of(capture)? {
             None => Self::Local(capture.to_owned()),
-            Some(address) => Self::Remote { store: storage.store(&address)?, place: storage.place(&address)?, address },
+            Some(address) => {
+                Self::Remote { store: storage.store(&address)?, place: Box::new(storage.place(&address)?), address }
+            }
         })
     }
 
@@ -111,9 +114,18 @@ impl Source {
         listener: &dyn Listener,
     ) -> Result<PathBuf> {
         let marker = "capture.json";
-        let folder = self.part(&|name| name == marker, stop, listener)?;
+        let count = Cell::new(0);
+        let folder = self.part(
+            &|name| {
+                count.set(count.get() + 1);
+                name == marker
+            },
+            stop,
+            listener,
+        )?;
         let text = std::fs::read(folder.join(marker)).unwrap_or_default();
-        let other = serde_json::from_slice::<Value>(&text).map(|capture| not_needed(&capture, recipe, frames));
+        let other =
+            serde_json::from_slice::<Value>(&text).map(|capture| not_needed(&capture, recipe, frames, count.get()));
         let other = other.unwrap_or_default();
         self.part(&|name| !other.contains(name), stop, listener)
     }
@@ -325,12 +337,12 @@ impl Work<'_> {
             Error::new(
                 ErrorKind::Io,
                 format!(
-                    "chunk {part} was taken over by another worker: this one did not reach the storage for {} s",
+                    "chunk {part} is not this worker's any more: the storage was out of reach for {} s",
                     DEAD.as_secs()
                 ),
             )
             .at(self.mirror.address)
-            .remedy("Nothing is lost. Check the network, and run the same command again for other chunks")
+            .remedy("Check the network, and run the same command again: what is uploaded is kept")
         };
         if lost.load(Ordering::Relaxed) {
             return Err(gone());
