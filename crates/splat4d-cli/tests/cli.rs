@@ -270,7 +270,7 @@ fn a_capture_is_trained_evaluated_and_exported() {
     splat4d(&["export", str(&run), "--tracks", str(&tracks), "--near", "0,0,-0.5", "--count", "2"]).run().ok();
     let json: Value = serde_json::from_str(&std::fs::read_to_string(&tracks).unwrap()).unwrap();
     assert_eq!((json["tracks"].as_array().unwrap().len(), json["times"].as_array().unwrap().len()), (2, 4));
-    assert!(splat4d(&["export", str(&run), "--tracks", "tracks.txt"]).run().refused().contains(".csv or .json"));
+    assert!(splat4d(&["export", str(&run), "--tracks", "tracks.txt"]).run().refused().contains(".csv, .json or .npz"));
     assert!(splat4d(&["export", str(&run), "-o", "x.ply", "--fps", "3"]).run().refused().contains("--sequence"));
     assert!(splat4d(&["info", str(&run.join("scene.safetensors"))]).run().ok().contains("spacetime"));
 }

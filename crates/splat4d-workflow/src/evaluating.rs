@@ -218,21 +218,26 @@ pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> R
     }
     let baked = Source::open(run).and_then(|mut source| {
         not_empty(&source.scene, run)?;
-        fold(&mut source, "a playback file", deadline, console)?;
+        let folded = fold(&mut source, "a playback file", deadline, console)?;
         let title = Run::open(run)?.name();
         let baking = Baking { deadline: deadline.clone(), ..Baking::default() };
-        bake_into(&source, &title, &run.join(playable::FILE), &baking, console)
+        bake_into(&source, &title, &run.join(playable::FILE), &baking, console).map(|report| (report, folded))
     });
     console.clear();
     match baked {
-        Ok(report) => amend(
-            run,
-            [
-                ("playback_bytes".into(), report["bytes"].clone()),
-                ("playback_psnr".into(), report["likeness"]["psnr"].clone()),
-                ("playback_seconds".into(), report["seconds"].clone()),
-            ],
-        ),
+        Ok((report, folded)) => {
+            if let Some(l) = folded {
+                amend(run, [("playback_head_psnr".into(), json!(l.psnr))])?;
+            }
+            amend(
+                run,
+                [
+                    ("playback_bytes".into(), report["bytes"].clone()),
+                    ("playback_psnr".into(), report["likeness"]["psnr"].clone()),
+                    ("playback_seconds".into(), report["seconds"].clone()),
+                ],
+            )
+        }
         Err(error) => {
             console.warn(&format!("the playback file was not written: {error}"));
             Ok(())

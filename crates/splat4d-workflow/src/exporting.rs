@@ -75,7 +75,7 @@ pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
 
 /// Folds a network that makes colours into spherical harmonics, for files of Gaussians. Errors: its cameras are unknown.
 pub fn fold(source: &mut Source, listener: &dyn Listener) -> Result<()> {
-    folding::fold(source, "a .ply file", &Deadline::default(), listener)
+    folding::fold(source, "a .ply file", &Deadline::default(), listener).map(drop)
 }
 
 /// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence

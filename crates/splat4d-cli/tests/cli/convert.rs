@@ -164,10 +164,12 @@ fn a_run_with_a_head_is_baked_exported_and_converted() {
         "{said}"
     );
     assert!(work.path().join("run/scene.s4d").is_file(), "training ends with a playback file");
+    let page = std::fs::read_to_string(work.path().join("run/report.html")).unwrap();
+    assert!(page.contains("spherical harmonics in place of the network: "), "the report states the loss");
     for args in [
         &["bake", "run", "-o", "a.s4d"][..],
         &["convert", "run", "a.splatv"],
-        &["convert", "run", "f_%d.spz", "--frames"],
+        &["convert", "run", "frames/f_%d.spz", "--frames"],
         &["export", "run", "-o", "a.ply", "--velocities"],
         &["export", "run", "-o", "a.html", "--html"],
     ] {

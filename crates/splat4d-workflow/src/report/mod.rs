@@ -163,7 +163,11 @@ fn cards(out: &mut String, run: &Run) {
     if let Some(bytes) = run.number("playback_bytes") {
         let text = human_bytes(bytes as u64);
         let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
-        let like = run.number("playback_psnr").map(|p| format!(", {p:.1} dB against the model")).unwrap_or_default();
+        // Of a scene with a pixel network, what spherical harmonics in its place cost.
+        let like = match run.number("playback_head_psnr") {
+            Some(p) => format!(", spherical harmonics in place of the network: {p:.1} dB"),
+            None => run.number("playback_psnr").map(|p| format!(", {p:.1} dB against the model")).unwrap_or_default(),
+        };
         card("", value.into(), unit, &format!("playback file scene.s4d{like}"));
     }
     out.push_str("</div>\n");
