@@ -6,7 +6,7 @@ use crate::errors::{OrRaise, bad_input};
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use serde_json::{Value, json};
-use splat4d::{Error, Result, scene};
+use splat4d::{Result, scene};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::encode::{self, Pixels};
 use splat4d_train::run::checkpoint::write_atomically;
