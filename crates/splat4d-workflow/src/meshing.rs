@@ -77,7 +77,7 @@ impl MeshFormat {
     }
 }
 
-/// Options of [`write`] and [`Mesher`].
+/// Options of [`write()`] and [`Mesher`].
 #[derive(Clone, Copy, Debug)]
 pub struct MeshOptions {
     /// Side of a voxel, scene units.

@@ -68,8 +68,15 @@ pub(super) fn remove_leftovers_once(file: &Path) {
 
 /// Removes a temporary file, or a folder of them.
 pub(super) fn remove(path: &Path) {
-    let folder = std::fs::symlink_metadata(path).is_ok_and(|m| m.is_dir());
-    let _ = if folder { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    if !std::fs::symlink_metadata(path).is_ok_and(|m| m.is_dir()) {
+        let _ = std::fs::remove_file(path);
+        return;
+    }
+    // A program that outlives its command may be about to create a file in the folder, and then the folder stays. Under
+    // another name it is not found; a file that was created at the same moment goes in the second attempt.
+    let aside = path.with_file_name(temporary_name(OsStr::new("gone")));
+    let gone = if std::fs::rename(path, &aside).is_ok() { &aside } else { path };
+    let _ = std::fs::remove_dir_all(gone).or_else(|_| std::fs::remove_dir_all(gone));
 }
 
 /// Whether this is a name that [`Staged`] makes up.
@@ -86,4 +93,27 @@ pub(super) fn machine() -> String {
     let text = format!("{boot}{}", space.display());
     let print = text.bytes().fold(OFFSET, |h, b| (h ^ u64::from(b)).wrapping_mul(PRIME));
     format!("{:08x}", print >> 32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_goes_while_another_program_writes_into_it() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join(temporary_name(OsStr::new("film")));
+        std::fs::create_dir(&folder).unwrap();
+        let (begun, writes) = std::sync::mpsc::channel();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let create = |n: usize| std::fs::File::create(folder.join(n.to_string())).is_ok();
+                (0..).take_while(|n| create(*n)).all(|n| begun.send(n).is_ok())
+            });
+            // Its first files are there.
+            assert_eq!(writes.recv(), Ok(0));
+            remove(&folder);
+        });
+        assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0);
+    }
 }
