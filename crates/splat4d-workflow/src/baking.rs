@@ -220,7 +220,7 @@ impl Kitchen<'_> {
                 "the scene's masks are not baked: Gaussians that they leave out are rendered. Its own .s4d has them.",
             );
         }
-        let antialias = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
+        let antialias = self.source.antialias();
         let (stage, named) = (self.source.stage(self.views), distinct(self.views));
         let meta = meta(scene, &Outline::of_baked(&baked), &stage, &named);
         let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();

@@ -329,8 +329,7 @@ fn like(
     console: &dyn Listener,
 ) -> Result<Option<Likeness>> {
     let file = dialect.open(bytes)?.scene;
-    let antialias = source.run.as_ref().and_then(|run| run.recipe().ok()).is_some_and(|r| r.appearance.antialias);
-    let likeness = baking::likeness(&source.scene, &file, shots, antialias, &mut |done, total| {
+    let likeness = baking::likeness(&source.scene, &file, shots, source.antialias(), &mut |done, total| {
         console.phase("comparing with the scene", done, total);
         true
     })?;

@@ -1,6 +1,7 @@
 //! Scenes whose colours a network makes pixel by pixel, for files that contain Gaussians only.
 
 use crate::deadline::Deadline;
+use crate::draw::antialias;
 use crate::events::Listener;
 use crate::paths::View;
 use crate::source::Source;
@@ -8,7 +9,7 @@ use splat4d::Result;
 use splat4d::bake::{Likeness, Shown, compare, fold_head};
 use splat4d::device;
 use splat4d::layers::Head;
-use splat4d::render::{Antialias, RenderConfig};
+use splat4d::render::RenderConfig;
 use splat4d::scene::Camera;
 
 /// Degree of the spherical harmonics (studies/records/2026-11-28-pixel-head.md).
@@ -33,8 +34,7 @@ pub fn fold(source: &mut Source, what: &str, deadline: &Deadline, console: &dyn 
     if views.iter().all(|v| v.held) {
         return source.scene.without_head(what).map(|()| None);
     }
-    let antialias = source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
-    let mode = if antialias { Antialias::On } else { Antialias::Off };
+    let mode = antialias(source.antialias());
     let (held, seen): (Vec<&View>, Vec<&View>) = views.iter().partition(|v| v.held);
     // Every time is shown, so that no Gaussian with a short lifespan is missed.
     let mut times: Vec<f64> = seen.iter().map(|v| v.time).collect();

@@ -68,7 +68,7 @@ fn complete_from(
 ) -> Result<u64> {
     let meta = append_to(growing, run, chunked, true, deadline, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
-    let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
+    let poster = poster(&first.scene, &first.stage(&first.views()?), first.antialias());
     let sound = first.run.as_ref().map_or(Ok(None), sound::of_run).unwrap_or_else(|e| {
         console.warn(&format!("the sound is left out: {e}"));
         None
@@ -174,10 +174,6 @@ fn append_to(
 /// A scene of the run.
 fn opened(run: &Path, scene: Scene<f32>) -> Result<Source> {
     Ok(Source { run: Some(Run::open(run)?), ..Source::own(scene) })
-}
-
-fn antialias(source: &Source) -> bool {
-    source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
 }
 
 fn union(a: Option<[[f64; 3]; 2]>, b: Option<[[f64; 3]; 2]>) -> Option<[[f64; 3]; 2]> {

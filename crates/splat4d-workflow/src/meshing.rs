@@ -7,6 +7,7 @@ mod mesh;
 mod solid;
 mod surface;
 
+use crate::draw::antialias;
 use crate::events::Listener;
 use crate::exporting::Frames;
 use crate::files::{self, either, grouped};
@@ -102,12 +103,12 @@ impl Default for MeshOptions {
 
 /// Makes meshes of a scene.
 pub struct Mesher<'a> {
-    source: &'a Source,
     player: Player<'a>,
     cameras: Vec<Camera>,
     /// Depth is that of centres, as the depth loss measures it.
     centers: bool,
     options: MeshOptions,
+    config: RenderConfig,
     grid_from_world: [[f64; 3]; 3],
 }
 
@@ -129,7 +130,8 @@ impl<'a> Mesher<'a> {
         let grid_from_world = rotation_between(source.scene.up, GRID_UP).unwrap_or(IDENTITY);
         let player = Player::of_scene(&source.scene);
         let centers = source.run.as_ref().is_some_and(trained_with_depth);
-        Ok(Self { source, player, cameras, centers, options: *options, grid_from_world })
+        let config = RenderConfig { antialias: antialias(source.antialias()), ..RenderConfig::default() };
+        Ok(Self { player, cameras, centers, options: *options, config, grid_from_world })
     }
 
     /// Where the surfaces are seen from, in words.
@@ -148,7 +150,6 @@ impl<'a> Mesher<'a> {
     /// Errors: voxels that are too small or too large for the scene.
     pub fn at(&mut self, time: f64) -> Result<Mesh> {
         let (options, turn) = (self.options, self.grid_from_world);
-        let smooth = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
         let splats = self.player.at(Time(time))?;
         let Some(bounds) = bounds(&splats, &turn) else { return Ok(Mesh::default()) };
         let side = (0..3).map(|k| bounds[1][k] - bounds[0][k]).fold(0.0, f64::max);
@@ -160,8 +161,7 @@ impl<'a> Mesher<'a> {
             .remedy(format!("Use {:.3} or less.", side / LEAST_VOXELS)));
         }
         let in_grid: Vec<Camera> = self.cameras.iter().map(|c| in_grid(c, &turn)).collect();
-        let config = RenderConfig { antialias: crate::draw::antialias(smooth), ..RenderConfig::default() };
-        let (mut backend, mut image) = (device::cpu(config), Image::default());
+        let (mut backend, mut image) = (device::cpu(self.config), Image::default());
         let inverses = inverses(&splats);
         let (mut shell, mut maps) = (Shell::new(options.voxel, bounds)?, Vec::new());
         for camera in views(&in_grid, bounds, options.voxel) {
@@ -254,7 +254,7 @@ pub fn write(
         let frame = 1.0 / scene.fps.max(f64::MIN_POSITIVE);
         if scene.is_moving() && !(scene.clip[0] - frame..=scene.clip[1] + frame).contains(&time) {
             return Err(Error::input(format!("invalid time {time} s: it is outside of the scene's clip"))
-                .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1])));
+                .remedy(format!("The scene lasts from {:.3} to {:.3} s.", scene.clip[0], scene.clip[1])));
         }
         Ok(())
     };

@@ -125,7 +125,7 @@ pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Lis
     args.photo.check_output(output, args, &source.scene)?;
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.or(background).unwrap_or(source.scene.background);
-    let painter = Painter::new(&source.scene, background, antialias(&source), depth);
+    let painter = Painter::new(&source.scene, background, source.antialias(), depth);
     let mut painter = channel(painter, args, &source, console)?;
     painter = painter.around(args.photo.panorama(size));
     let shot = paths::Shot { camera, time: args.freeze.unwrap_or(source.scene.clip[0]) };
@@ -288,7 +288,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     }
     let background = args.background.unwrap_or(scene.background);
     let depth = args.channel == Channel::Depth;
-    let painter = channel(Painter::new(scene, background, antialias(&source), depth), args, &source, console)?;
+    let painter = channel(Painter::new(scene, background, source.antialias(), depth), args, &source, console)?;
     let mut painter = painter.around(args.photo.panorama(size));
     let plain = matches!(args.channel, Channel::Color | Channel::Alpha | Channel::Normal | Channel::Label);
     let range = if plain { NO_RANGE } else { range(&mut painter, &shots) };
@@ -417,10 +417,6 @@ fn range(painter: &mut Painter<'_>, shots: &[paths::Shot]) -> [f32; 2] {
         }
     }
     range.unwrap_or(NO_RANGE)
-}
-
-fn antialias(source: &Source) -> bool {
-    source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
 }
 
 fn default_output(path: &Path, route: &Route, run: bool) -> PathBuf {

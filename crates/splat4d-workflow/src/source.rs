@@ -86,6 +86,11 @@ pub fn keep_all(path: &Path, run: Option<&Run>, outputs: &[&Path], others: &[&Pa
 }
 
 impl Source {
+    /// Whether the run trained it with antialiasing; a file without a run was not.
+    pub fn antialias(&self) -> bool {
+        self.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
+    }
+
     /// Opens a run, a file or a sequence.
     pub fn open(path: &Path) -> Result<Self> {
         Self::open_at(path, DEFAULT_FPS)
