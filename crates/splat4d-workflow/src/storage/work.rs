@@ -7,7 +7,7 @@ use super::{Address, Place, Storage, Store};
 use crate::chunked::{self, ChunkSelection};
 use crate::deadline::Deadline;
 use crate::evaluating::Measure;
-use crate::events::Listener;
+use crate::events::{Event, Listener};
 use crate::inspecting::{self, InspectOptions, Inspection};
 use crate::status::{self, Status};
 use crate::training::{self, Trained, TrainingOptions};
@@ -331,7 +331,8 @@ impl Work<'_> {
                 grow: false,
                 ..self.options.clone()
             };
-            training::train(capture, self.recipe, &options, &halt, self.listener)
+            let listener = Stopping { listener: self.listener, stop: self.stop, halt: &halt };
+            training::train(capture, self.recipe, &options, &halt, &listener)
         });
         let gone = || {
             Error::new(
@@ -373,6 +374,27 @@ struct Over<'a>(&'a AtomicBool);
 impl Drop for Over<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// A listener that hands the user's stop on at every event: a stop at the last checkpoint of a short part would
+/// otherwise come after its end.
+struct Stopping<'a> {
+    listener: &'a dyn Listener,
+    stop: &'a AtomicBool,
+    halt: &'a AtomicBool,
+}
+
+impl Listener for Stopping<'_> {
+    fn on_event(&self, event: &Event<'_>) {
+        self.listener.on_event(event);
+        if self.stop.load(Ordering::Relaxed) {
+            self.halt.store(true, Ordering::Relaxed);
+        }
+    }
+
+    fn snapshots(&self) -> Option<Duration> {
+        self.listener.snapshots()
     }
 }
 
