@@ -1,9 +1,11 @@
 // A bitrate ladder (docs/format.md, "Ladder"): which rung of a file is loaded and rendered, by the measured throughput of
 // the connection and the measured time of a frame. Pure logic: nothing here touches a browser.
 
-/// Busy time of a connection that makes a sample, ms; fewer bytes than this are latency and no sample of their own.
+/// Busy time of a connection that makes a sample, ms; fewer bytes than this are latency and no sample of their own. An
+/// open request that brings nothing for so long is slow, ms: a page that is busy reads late.
 const SAMPLE = 200,
-  SMALL = 32 << 10;
+  SMALL = 32 << 10,
+  SILENT = 1000;
 /// Samples that count, and the newest ones that a drop shows in at once.
 const SAMPLES = 8,
   NEWEST = 2;
@@ -26,13 +28,29 @@ const SLOW = 37,
 const SMOOTH = 0.2;
 
 /// Bits per second of a connection while it is busy: the harmonic mean of the last samples, or less where the newest are
-/// slower.
+/// slower. Counted by the page, or, where the browser states them, by its own times of requests (`timed`): a page that
+/// renders slowly reads late.
 export class Throughput {
   #open = 0;
   #since = 0;
   #busy = 0;
   #bytes = 0;
   #samples = [];
+  #timed = [];
+  #upto = 0;
+  #sum = { bytes: 0, ms: 0 };
+
+  /// The browser's own times of a finished request: bytes from one time to the other, ms. Times that overlap count once.
+  timed(bytes, from, to) {
+    const sum = this.#sum;
+    sum.ms += Math.max(0, to - Math.max(from, this.#upto));
+    sum.bytes += bytes;
+    this.#upto = Math.max(this.#upto, to);
+    if (sum.bytes < SMALL) return;
+    this.#timed.push({ bytes: sum.bytes, ms: Math.max(sum.ms, 1) });
+    if (this.#timed.length > SAMPLES) this.#timed.shift();
+    sum.bytes = sum.ms = 0;
+  }
 
   /// A request begins.
   begin(now) {
@@ -65,7 +83,8 @@ export class Throughput {
   /// Bits per second; 0 before anything was measured. A connection that is silent counts as slow.
   rate(now) {
     const silent = this.#open ? this.#busy + now - this.#since : 0,
-      all = silent > 2 * SAMPLE ? [...this.#samples, { bytes: this.#bytes, ms: silent }] : this.#samples;
+      samples = this.#timed.length ? this.#timed : this.#samples,
+      all = silent > SILENT ? [...samples, { bytes: this.#bytes, ms: silent }] : samples;
     const mean = (list) => (8000 * list.reduce((n, s) => n + s.bytes, 0)) / list.reduce((n, s) => n + s.ms, 0);
     return all.length ? Math.min(mean(all), mean(all.slice(-NEWEST))) : 0;
   }
@@ -148,7 +167,7 @@ export class Ladder {
   /// too slow, and below which there is time to spare.
   frame(ms, now, shown, { stuck = true, slow = SLOW, fast = FAST } = {}) {
     if (this.rungs.length < 2 || this.#pinned !== null) return;
-    // The first frame after a change still has the Gaussians of before.
+    // The first frame after a change still has the previous Gaussians.
     this.#ms = this.#frames++ > 1 ? this.#ms + SMOOTH * (ms - this.#ms) : ms;
     if (this.#frames === 1) this.#changed = Math.max(this.#changed, now - ms);
     const since = now - this.#changed;

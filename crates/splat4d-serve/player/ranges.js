@@ -60,8 +60,21 @@ export class Remote {
   #memory = null;
   #throughput = new Throughput();
 
+  #observer = null;
+
   constructor(url) {
     this.url = url;
+    const name = new URL(url, globalThis.location?.href).href;
+    if (!globalThis.PerformanceObserver?.supportedEntryTypes?.includes('resource')) return;
+    this.#observer = new PerformanceObserver((list) => {
+      for (const e of list.getEntries()) {
+        // Of another origin, a server may hide the times.
+        if (e.name === name && e.encodedBodySize > 0 && e.requestStart > 0) {
+          this.#throughput.timed(e.encodedBodySize, e.requestStart, e.responseEnd);
+        }
+      }
+    });
+    this.#observer.observe({ type: 'resource' });
   }
 
   /// Reads the first `length` bytes; from a server without ranges the whole. `onprogress(read, total)` then.
@@ -126,6 +139,7 @@ export class Remote {
   }
 
   close() {
+    this.#observer?.disconnect();
     this.#closed.abort();
     for (const job of this.#queue.splice(0)) if (!job.done) job.leave();
   }

@@ -22,6 +22,8 @@ const AHEAD = 2,
 const STEP = 8;
 /// Pages in flight for later: few, so that a seek is not behind many.
 const LATER = 4;
+/// While coarse pages with more bytes than this are on their way, no finer ones of their time are: they would share the line.
+const HEAVY = 256 << 10;
 /// The throughput of the connection is examined at this interval, ms.
 const STEER = 200;
 /// Pages of higher rungs in flight while the connection is idle.
@@ -324,7 +326,10 @@ export class Stream {
   #pump() {
     if (this.#over) return;
     let open = false;
+    const missing = this.#now.filter((page) => this.#coarse.has(page.id) && (this.#flight.has(page.id) || this.#wants(page)));
+    const heavy = missing.reduce((n, page) => n + (page.stored ?? 0), 0) > HEAVY;
     for (const page of this.#now) {
+      if (heavy && !this.#coarse.has(page.id)) continue;
       if (this.#wants(page)) this.#load(page);
       open ||= this.#flight.has(page.id);
     }

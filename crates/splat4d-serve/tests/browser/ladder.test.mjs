@@ -38,6 +38,17 @@ test('throughput counts busy time only, and follows a connection that becomes sl
   assert.ok(silent < 2e6, `a connection that is silent for 5 s is slow: ${silent}`);
 });
 
+test('times of the browser count instead of those of a page that reads late', () => {
+  const t = new Throughput();
+  t.begin(0);
+  t.add(125_000, 900);
+  t.end(900);
+  // Two requests that overlap: 125,000 bytes in 100 ms.
+  t.timed(60_000, 0, 80);
+  t.timed(65_000, 20, 100);
+  assert.ok(Math.abs(t.rate(900) / 1e7 - 1) < 0.01, `${t.rate(900)}`);
+});
+
 test('a small first answer is measured, but not its latency alone', () => {
   const t = new Throughput();
   t.begin(0);

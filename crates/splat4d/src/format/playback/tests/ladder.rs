@@ -135,6 +135,13 @@ fn damaged_ladders_are_refused_and_changed_pages_state_none() {
     ] {
         assert!(Meta { ladder, ..index.meta.clone() }.check().is_err());
     }
+    // A rate that is not kept is a deviation.
+    let mut low = index.clone();
+    low.meta.ladder[0].rate = 0.5e6;
+    let head = low.bytes("test");
+    let bodies: Vec<u8> = index.sections.iter().flat_map(|e| stored(&bytes, e).to_vec()).collect();
+    let found = strict(&[head, bodies].concat()).unwrap();
+    assert!(found.iter().any(|d| d.contains("rung 1 of the ladder needs")), "{found:?}");
     let pages = read_pages(&bytes).unwrap();
     let mut again = Vec::new();
     write_pages(&pages.draft(None), &WriteConfig::default(), &mut again).unwrap();
