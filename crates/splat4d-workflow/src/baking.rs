@@ -156,8 +156,7 @@ fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
     let Cameras { still, path } = Cameras::of(views);
     let cameras = still.iter().map(|v| v.camera.clone()).collect();
     let path = path.iter().map(|v| (v.time, v.camera.clone())).collect();
-    let peel = baking.options.peel || !baking.ladder.is_empty();
-    let mut options = Options { cameras, path, peel, ..baking.options.clone() };
+    let mut options = Options { cameras, path, ..baking.options.clone() };
     let deadline = &baking.deadline;
     if deadline.is_set() {
         let mut instant = Evaluation::default();
@@ -293,7 +292,8 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
     let started = baking.deadline.now();
     ladder::check(&baking.ladder)?;
     let bytes = baking.bytes.or_else(|| highest(&source.scene, baking));
-    let baking = &Baking { bytes, ..baking.clone() };
+    let peel = baking.options.peel || !baking.ladder.is_empty();
+    let baking = &Baking { bytes, options: Options { peel, ..baking.options.clone() }, ..baking.clone() };
     let baking = &Baking { bytes: sound::left(source.sound.as_ref(), baking.bytes)?, ..baking.clone() };
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
     let Packed { mut bytes, baked, summary, antialias, .. } = packed;
