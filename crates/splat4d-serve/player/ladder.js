@@ -37,13 +37,18 @@ export class Throughput {
   #bytes = 0;
   #samples = [];
   #timed = [];
+  #waits = [];
   #upto = 0;
   #sum = { bytes: 0, ms: 0 };
 
-  /// The browser's own times of a finished request: bytes from one time to the other, ms. Times that overlap count once.
-  timed(bytes, from, to) {
+  /// The browser's own times of a finished request: when it began, its first byte came and its last, ms. Times that
+  /// overlap count once. The shortest wait for a first byte is the latency: short answers would measure little else.
+  timed(bytes, from, first, to) {
     const sum = this.#sum;
-    sum.ms += Math.max(0, to - Math.max(from, this.#upto));
+    this.#waits.push(first - from);
+    if (this.#waits.length > SAMPLES) this.#waits.shift();
+    const latency = Math.min(...this.#waits, 0.8 * (to - from));
+    sum.ms += Math.max(0, to - Math.max(from + latency, this.#upto));
     sum.bytes += bytes;
     this.#upto = Math.max(this.#upto, to);
     if (sum.bytes < SMALL) return;

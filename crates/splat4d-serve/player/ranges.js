@@ -70,7 +70,7 @@ export class Remote {
       for (const e of list.getEntries()) {
         // Of another origin, a server may hide the times.
         if (e.name === name && e.encodedBodySize > 0 && e.requestStart > 0) {
-          this.#throughput.timed(e.encodedBodySize, e.requestStart, e.responseEnd);
+          this.#throughput.timed(e.encodedBodySize, e.requestStart, e.responseStart, e.responseEnd);
         }
       }
     });

@@ -44,9 +44,13 @@ test('times of the browser count instead of those of a page that reads late', ()
   t.add(125_000, 900);
   t.end(900);
   // Two requests that overlap: 125,000 bytes in 100 ms.
-  t.timed(60_000, 0, 80);
-  t.timed(65_000, 20, 100);
+  t.timed(60_000, 0, 0, 80);
+  t.timed(65_000, 20, 20, 100);
   assert.ok(Math.abs(t.rate(900) / 1e7 - 1) < 0.01, `${t.rate(900)}`);
+  // Every answer begins after 100 ms, then brings 62,500 bytes in 50 ms.
+  const late = new Throughput();
+  for (let at = 0; at < 2000; at += 200) late.timed(62_500, at, at + 100, at + 150);
+  assert.ok(Math.abs(late.rate(2000) / 1e7 - 1) < 0.01, `${late.rate(2000)}`);
 });
 
 test('a small first answer is measured, but not its latency alone', () => {
