@@ -15,6 +15,7 @@ use tempfile::TempDir;
 
 pub(crate) const READERS: &[Reader] = &[
     Reader { name: "capture_json", seeds: || vec![own().into()], read: |b| open("own", "capture.json", b) },
+    Reader { name: "priors_json", seeds: || vec![PRIORS.into()], read: |b| open("priors", "priors/priors.json", b) },
     Reader {
         name: "transforms_json",
         seeds: || vec![transforms().into()],
@@ -81,6 +82,9 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "picture", seeds: pictures, read: |b| drop(Rgb8::decode(b, Path::new("picture"))) },
 ];
 
+/// The list of what networks wrote.
+const PRIORS: &str = r#"{"version": 1, "writer": "splat4d", "depth": {"kind": "inverse", "scale": 1.0, "files": {"images/0.png": "depth/0.npy"}},
+"masks": {"files": {"images/0.png": "masks/0.png"}}, "tracks": {"files": {"a": "tracks.csv"}}}"#;
 const WIDTH: u32 = 8;
 const HEIGHT: u32 = 6;
 
@@ -141,6 +145,12 @@ fn made(layout: &str) -> TempDir {
     files.iter().for_each(|name| put(name, &png()));
     match layout {
         "own" => put("capture.json", own().as_bytes()),
+        "priors" => {
+            put("capture.json", own().as_bytes());
+            put("priors/depth/0.npy", &floats(&[6, 8]));
+            put("priors/masks/0.png", &grey(255));
+            put("priors/tracks.csv", TRACKS.as_bytes());
+        }
         "nerf" => put("transforms.json", transforms().as_bytes()),
         "panoptic" => put("train_meta.json", panoptic().as_bytes()),
         "n3dv" => put("poses_bounds.npy", &poses_bounds()),

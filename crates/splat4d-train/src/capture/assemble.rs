@@ -8,7 +8,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawCapture, RawFrame,
     Rig, Split, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
+use super::{borders, computed, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
 use rayon::prelude::*;
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
@@ -38,6 +38,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     skip_missing(&mut take, options).map_err(located)?;
     skip_repeated(&mut take);
     masks::fill(&mut take)?;
+    computed::fill(&mut take)?;
     let in_part = take.take != Extent::default();
     if !in_part {
         drop_unused_cameras(&mut take, &used);

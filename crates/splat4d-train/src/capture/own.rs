@@ -469,7 +469,7 @@ impl Depth {
 
     fn file(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<DepthFile>> {
         let path = self.files.path(lookup, start, index)?;
-        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind }))
+        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind, fit: None }))
     }
 }
 

@@ -1,5 +1,6 @@
 //! The run on disk: a folder with its recipe, checkpoints, metrics and scene; resume, rollback, `--minutes`.
 
+mod aligned;
 mod budget;
 pub mod checkpoint;
 pub mod chunks;
