@@ -8,9 +8,8 @@ use splat4d::math::sym3;
 const NEIGHBOURS: usize = 12;
 /// Points in a leaf of the tree.
 const LEAF: usize = 8;
-/// Of the distance of the farthest of these neighbours, the radius of a disc: on a regular grid of spacing s they reach
-/// to 2 s, and discs of 1.2 s cover it without holes.
-const RADIUS: f32 = 0.6;
+/// A disc is at most this many times as large as its neighbours' (median): a lone point would hide what is behind it.
+const LARGER: f32 = 2.0;
 /// Neighbours lie on a surface if the smallest of their variances is below this share of the middle one.
 const FLAT: f64 = 0.25;
 
@@ -42,15 +41,31 @@ impl Placed {
     }
 }
 
+/// The radius of a disc is the distance of the farthest neighbour: points at random then have a dozen discs over each
+/// place, and one in a hundred thousand has none.
 fn discs(points: &[[f32; 3]]) -> Vec<Disc> {
     let tree = Tree::new(points);
     let mut near = Vec::with_capacity(NEIGHBOURS + 1);
+    let mut neighbours = Vec::with_capacity(points.len() * (NEIGHBOURS + 1));
+    let mut ends = Vec::with_capacity(points.len());
     let disc = |i: usize| {
         tree.nearest(i, &mut near);
-        let farthest = near.last().map_or(0.0, |n| n.0.sqrt());
-        Disc { center: points[i], normal: normal(points, &near), radius: RADIUS * farthest }
+        neighbours.extend(near.iter().map(|n| n.1));
+        ends.push(neighbours.len());
+        let radius = near.last().map_or(0.0, |n| n.0.sqrt());
+        Disc { center: points[i], normal: normal(points, &near), radius }
     };
-    (0..points.len()).map(disc).collect()
+    let mut discs: Vec<Disc> = (0..points.len()).map(disc).collect();
+    let radii: Vec<f32> = discs.iter().map(|d| d.radius).collect();
+    let (mut start, mut around) = (0, Vec::with_capacity(NEIGHBOURS + 1));
+    for (disc, end) in discs.iter_mut().zip(ends) {
+        around.clear();
+        around.extend(neighbours[start..end].iter().map(|&n| radii[n as usize]));
+        around.sort_by(f32::total_cmp);
+        disc.radius = disc.radius.min(LARGER * around[around.len() / 2]);
+        start = end;
+    }
+    discs
 }
 
 /// The direction in which the neighbours vary least, if they lie on a surface.
