@@ -36,6 +36,7 @@ const GUIDES = [
   ['docs/evaluate', 'Measure and compare runs'],
   ['docs/render', 'Render images and films'],
   ['docs/file-size', 'Limit the file size'],
+  ['docs/ladder', 'Bitrate ladder'],
   ['docs/compression', 'Compress'],
   ['docs/engines', 'Hand over to another program'],
   ['docs/meshes', 'Write meshes'],

@@ -24,6 +24,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("capture/evidence/copies.rs", Not("images are compared byte by byte")),
     ("capture/features.rs", By(&["features_npy"])),
     ("capture/flow.rs", By(&["flow_png", "flow_flo", "flow_npy"])),
+    ("capture/geometry.rs", By(&["scan_las", "scan_pcd", "scan_e57", "scan_obj", "scan_ply"])),
     ("capture/foreign/metashape.rs", By(&["metashape_xml"])),
     ("capture/foreign/realityscan.rs", By(&["realityscan_csv"])),
     (
@@ -84,7 +85,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("run/refine.rs", By(&["recipe"])),
     ("run/session.rs", By(&["checkpoint", "checkpoint_moving"])),
     ("run/start.rs", By(&["recipe", "run_json", "scene"])),
-    ("run_folder.rs", By(&["run_json", "cameras_json", "compress_json", "metrics_csv"])),
+    ("run_folder.rs", By(&["run_json", "cameras_json", "compress_json", "geometry_json", "metrics_csv"])),
     ("scene.rs", By(&["playback"])),
     ("serving.rs", PASSED),
     ("shipped.rs", By(&["poses_bounds"])),

@@ -361,11 +361,12 @@ impl Scene {
         })
     }
 
-    /// Writes one seekable file that plays anywhere (.s4d); `tolerance`: largest error of a Gaussian, pixels.
-    #[pyo3(signature = (path, *, tolerance=None))]
-    fn bake(&self, py: Python<'_>, path: PathBuf, tolerance: Option<f64>) -> PyResult<()> {
+    /// Writes one seekable file that plays anywhere (.s4d); `tolerance`: largest error of a Gaussian, pixels; `ladder`:
+    /// rates in Mbit/s, rising, among which players choose.
+    #[pyo3(signature = (path, *, tolerance=None, ladder=None))]
+    fn bake(&self, py: Python<'_>, path: PathBuf, tolerance: Option<f64>, ladder: Option<Vec<f64>>) -> PyResult<()> {
         let options = Options { tolerance: tolerance.unwrap_or(TOLERANCE), ..Options::default() };
-        let baking = Baking { options, tolerance, ..Baking::default() };
+        let baking = Baking { options, tolerance, ladder: ladder.unwrap_or_default(), ..Baking::default() };
         let work =
             |file: &Path, _: &Path| listening(|listener| baking::bake(file, &path, None, &baking, listener).map(drop));
         crate::errors::warn(py, &self.with_file(py, work)?)

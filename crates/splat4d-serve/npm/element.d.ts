@@ -33,7 +33,25 @@ export interface Splat4DAttributes {
   heading?: string;
   /** Without sound. */
   muted?: boolean;
+  /** The rung of the file's bitrate ladder that alone is rendered, 1 the coarsest. */
+  rung?: 'auto' | number | string;
   page?: boolean;
+}
+
+/** What is rendered of a bitrate ladder; rungs count from 1. */
+export interface LadderState {
+  /** Rung of what is loaded; 0: none is complete. */
+  rung: number;
+  /** Rung that is loaded first. */
+  chosen: number;
+  /** Highest rung that the device renders fast enough. */
+  limit: number;
+  rungs: number;
+  reason: 'start' | 'connection' | 'device' | 'pinned' | 'whole';
+  /** Mbit/s of the chosen rung. */
+  rate: number;
+  /** Gaussians of the time that are not loaded. */
+  leftOut: number;
 }
 
 export interface Splat4DEventMap extends HTMLElementEventMap {
@@ -41,6 +59,7 @@ export interface Splat4DEventMap extends HTMLElementEventMap {
   timeupdate: CustomEvent<{ time: number }>;
   volumechange: CustomEvent;
   channelchange: CustomEvent<{ channel: Channel }>;
+  rungchange: CustomEvent<LadderState>;
   camerachange: CustomEvent<{ camera: CameraState }>;
   error: CustomEvent<{ what: string; where: string; remedy: string }> & ErrorEvent;
 }
@@ -57,6 +76,9 @@ export class Splat4D extends HTMLElement {
   readonly duration: number;
   readonly paused: boolean;
   muted: boolean;
+  rung: 'auto' | number;
+  /** Null for a file without a ladder. */
+  readonly ladder: LadderState | null;
   /** 0 to 1. */
   volume: number;
   get camera(): CameraState;

@@ -1,3 +1,5 @@
+import type { LadderState } from './element.js';
+
 export interface FramesOptions {
   /** Pages came: what `at` returns changes. */
   onchange?: () => void;
@@ -5,6 +7,8 @@ export interface FramesOptions {
   onerror?: (error: Error) => void;
   /** Bytes of pages that stay in memory. */
   budget?: number;
+  /** The rung of a bitrate ladder that alone is loaded, 1 the coarsest. 'auto' where left out. */
+  rung?: 'auto' | number;
 }
 
 /** What is visible at a time, in the file's axes. The arrays are those of the next call too. */
@@ -38,6 +42,8 @@ export class Frames {
   /** 0.1 to 4. */
   speed: number;
   readonly duration: number;
+  /** At `time`; null for a file without a ladder. */
+  readonly ladder: LadderState | null;
   tick(now?: number): void;
   /** Sets the clock and resolves when the pages of that time are there. Rejects where one of them cannot be read. */
   load(time: number): Promise<void>;

@@ -9,6 +9,7 @@
 import { NEAR } from './player/camera.js';
 import { SH, SPEED_RANGE, STEP_MAX } from './player/constants.js';
 import { cutShort } from './player/errors.js';
+import { Ladder, rungOf } from './player/ladder.js';
 import { advance } from './player/schedule.js';
 import { SceneFile } from './player/scene-file.js';
 import { Stream } from './player/stream.js';
@@ -171,8 +172,8 @@ export class Frames {
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages arrived: what `at` returns
   /// changes then. `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of
-  /// pages that stay in memory.
-  constructor(source, { onchange = () => {}, onerror = () => {}, budget } = {}) {
+  /// pages that stay in memory. `rung`: 'auto', or the rung of a bitrate ladder that alone is loaded, from 1 on.
+  constructor(source, { onchange = () => {}, onerror = () => {}, budget, rung = 'auto' } = {}) {
     this.ready = SceneFile.open(source).then((file) => {
       if (this.#gone) return file.close();
       this.#file = file;
@@ -183,7 +184,8 @@ export class Frames {
         this.#failure = error;
         onerror(error);
       };
-      this.#stream = new Stream(file, this.#pages, { ...(budget ? { budget } : {}), onchange, onerror: failed });
+      const ladder = Object.assign(new Ladder(file.meta.ladder), { pinned: rungOf(rung) });
+      this.#stream = new Stream(file, this.#pages, { ...(budget ? { budget } : {}), ladder, onchange, onerror: failed });
       if (file.truncated) failed(cutShort(file, source));
       this.#stream.update(this.time);
       onchange();
@@ -220,6 +222,11 @@ export class Frames {
     return this.meta ? this.meta.clip[1] - this.meta.clip[0] : 0;
   }
 
+  /// {rung, chosen, limit, rungs, reason, rate, leftOut} at `time` (docs/player.md); null without a bitrate ladder.
+  get ladder() {
+    return this.#stream?.rungs(this.time) ?? null;
+  }
+
   /// Moves the clock: once per frame. A clock whose pages have not arrived waits.
   tick(now = performance.now()) {
     if (!this.#stream) return;
@@ -244,7 +251,7 @@ export class Frames {
     if (!this.#stream) return;
     await this.#stream.settled(time);
     if (this.#gone) return;
-    const whole = this.#stream.ready(time) === 1 && !this.#file.lacks(time);
+    const whole = this.#stream.ready(time, Infinity) === 1 && !this.#file.lacks(time);
     if (this.#failure && !whole) throw this.#failure;
   }
 

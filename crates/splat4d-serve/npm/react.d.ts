@@ -8,7 +8,7 @@ export * from './element.js';
 /** Events as React passes them to custom elements: `ontimeupdate`. */
 type Listeners = {
   [K in
-    | 'load' | 'timeupdate' | 'play' | 'pause' | 'ended' | 'error' | 'ratechange' | 'channelchange'
+    | 'load' | 'timeupdate' | 'play' | 'pause' | 'ended' | 'error' | 'ratechange' | 'channelchange' | 'rungchange'
     | 'camerachange' as `on${K}`]?: (event: Splat4DEventMap[K]) => void;
 };
 

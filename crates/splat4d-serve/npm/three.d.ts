@@ -1,4 +1,7 @@
 import { Matrix4, Mesh } from 'three';
+import type { LadderState } from './element.js';
+
+export type { LadderState };
 
 export interface Splat4DOptions {
   /** A better image can be drawn: pages came, or a new order. */
@@ -9,6 +12,8 @@ export interface Splat4DOptions {
   up?: 'x' | 'y' | 'z' | null;
   /** Load the file's sound after the first image, and play it with the clock. */
   sound?: boolean;
+  /** The rung of the file's bitrate ladder that alone is rendered, 1 the coarsest. 'auto' where left out. */
+  rung?: 'auto' | number;
 }
 
 /** What is heard; it fires volumechange. */
@@ -45,6 +50,10 @@ export class Splat4D extends Mesh {
   readonly objectFromFile: Matrix4;
   readonly duration: number;
   readonly drawn: number;
+  /** The rung of the file's bitrate ladder that alone is rendered, 1 the coarsest. */
+  rung: 'auto' | number;
+  /** Null for a file without a ladder. */
+  readonly ladder: LadderState | null;
   /** Null without the option. */
   readonly sound: Sound | null;
   /** Resolves when `time` is loaded and the next image shows it. */

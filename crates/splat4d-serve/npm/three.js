@@ -9,6 +9,7 @@ import * as THREE from 'three';
 import { NEAR } from './player/camera.js';
 import { SPEED_RANGE, STEP_MAX } from './player/constants.js';
 import { BATCH, CHANNELS, ORDER_WIDTH, SPLAT } from './player/glsl.js';
+import { Ladder, rungOf } from './player/ladder.js';
 import { Order } from './player/order.js';
 import { Follower, Schedule, advance } from './player/schedule.js';
 import { SceneFile } from './player/scene-file.js';
@@ -21,6 +22,8 @@ const { ROW } = globalThis.splat4dSort;
 /// Rows of the words' texture to begin with.
 const FIRST_ROWS = 32;
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
+/// A longer time between two frames is a page that rested, ms.
+const PAUSED = 500;
 /// Marks a clock that waits for pages: no other time can be rendered.
 const HOLD = () => null;
 
@@ -111,6 +114,11 @@ export class Splat4D extends THREE.Mesh {
   #drawn = 0;
   #onchange;
   #waiting = [];
+  /// The choice of the rung, from `ready` on; and the one that alone is rendered.
+  #ladder = new Ladder();
+  #pin = null;
+  /// When the last frame began, ms.
+  #frameAt = NaN;
   /// Whether sound is to be loaded.
   #sounds;
   #scratch = { view: new THREE.Matrix4(), viewport: new THREE.Vector4(), rows: new Float64Array(12) };
@@ -119,8 +127,8 @@ export class Splat4D extends THREE.Mesh {
   /// came,
   /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`:
   /// the object's axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes. `sound`: the
-  /// file's sound plays with the clock.
-  constructor(source, { onchange = () => {}, budget, up = 'y', sound = false } = {}) {
+  /// file's sound plays with the clock. `rung`: 'auto', or the rung of a bitrate ladder that alone is rendered, from 1 on.
+  constructor(source, { onchange = () => {}, budget, up = 'y', sound = false, rung = 'auto' } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();
     geometry.setIndex(new THREE.BufferAttribute(corners(), 1));
     geometry.instanceCount = 0;
@@ -153,6 +161,7 @@ export class Splat4D extends THREE.Mesh {
     this.#onchange = onchange;
     if (sound) this.sound = new Sound();
     this.#sounds = sound;
+    this.#pin = rungOf(rung);
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     this.#schedule = new Schedule(this.#order);
     this.ready = SceneFile.open(source).then((file) => {
@@ -164,7 +173,9 @@ export class Splat4D extends THREE.Mesh {
         const [from, to] = [file.meta.up, AXES[up]].map((axis) => new THREE.Vector3(...axis).normalize());
         this.objectFromFile.makeRotationFromQuaternion(new THREE.Quaternion().setFromUnitVectors(from, to));
       }
-      this.#stream = new Stream(file, this, { ...(budget ? { budget } : {}), onchange: () => this.#onchange() });
+      this.#ladder = Object.assign(new Ladder(file.meta.ladder), { pinned: this.#pin });
+      const options = { ...(budget ? { budget } : {}), ladder: this.#ladder, onchange: () => this.#onchange() };
+      this.#stream = new Stream(file, this, options);
       this.#onchange();
     });
     this.ready.catch(() => {});
@@ -228,6 +239,20 @@ export class Splat4D extends THREE.Mesh {
   /// Seconds that it lasts; 0 until it is open.
   get duration() {
     return this.meta ? this.meta.clip[1] - this.meta.clip[0] : 0;
+  }
+
+  /// 'auto', or the rung of the file's bitrate ladder that alone is rendered, 1 the coarsest.
+  get rung() {
+    return this.#pin === null ? 'auto' : this.#pin + 1;
+  }
+  set rung(x) {
+    this.#ladder.pinned = this.#pin = rungOf(x);
+    this.#onchange();
+  }
+
+  /// {rung, chosen, limit, rungs, reason, rate, leftOut} of the newest image (docs/player.md); null without a ladder.
+  get ladder() {
+    return this.#stream?.rungs(this.renderedTime) ?? null;
   }
 
   /// Gaussians in the newest order.
@@ -302,6 +327,10 @@ export class Splat4D extends THREE.Mesh {
     if (frame === this.#frame) return;
     this.#frame = frame;
     const { clip } = this.meta;
+    // The page chooses the number of pixels: where frames are late, a lower rung is what helps here.
+    const took = now - this.#frameAt;
+    if (this.#playing && took < PAUSED) this.#ladder.frame(took, now, this.#stream.shown(this.renderedTime).rung);
+    this.#frameAt = now;
     if (this.#sounds && this.#drawn) {
       this.#sounds = false;
       this.sound.load(this.#file).catch(() => {});

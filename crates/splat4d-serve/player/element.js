@@ -7,10 +7,10 @@ import { h } from './dom.js';
 import { readLink, vector } from './camera.js';
 
 const OBSERVED = ['src', 'controls', 'time', 'speed', 'loop', 'backend', 'channel', 'background', 'camera', 'poster',
-  'theme', 'resolution', 'heading', 'muted'];
+  'theme', 'resolution', 'heading', 'muted', 'rung'];
 /** Events of the player that the element shows to its page. */
 const EVENTS = ['load', 'timeupdate', 'play', 'pause', 'ended', 'error', 'camerachange', 'channelchange', 'labelschange',
-  'ratechange', 'volumechange'];
+  'ratechange', 'volumechange', 'rungchange'];
 
 /** Hosts of pages that are being written. */
 const LOCAL = ['', 'localhost', '127.0.0.1', '[::1]'];
@@ -110,6 +110,7 @@ export class Splat4D extends HTMLElement {
       poster: () => value && ui.setPoster(new URL(value, document.baseURI).href),
       theme: () => value && ui.setTheme(['light', 'dark'].includes(value) ? value : 'auto'),
       resolution: () => value && ui.setResolution(value === 'auto' ? value : +value),
+      rung: () => { p.rung = value; ui.refresh(); },
       muted: () => { p.sound.muted = value !== null; },
       heading: () => ui.setTitle(value ?? p.meta?.title),
     };
@@ -176,6 +177,11 @@ export class Splat4D extends HTMLElement {
   get seeking() { return this.#player?.seeking ?? false; }
   get muted() { return this.#player?.sound.muted ?? this.hasAttribute('muted'); }
   set muted(on) { if (this.#player) this.#player.sound.muted = on; else this.toggleAttribute('muted', !!on); }
+  /** 'auto', or the rung of the ladder that alone is rendered, 1 the coarsest. */
+  get rung() { return this.#player?.rung ?? this.getAttribute('rung') ?? 'auto'; }
+  set rung(x) { if (this.#player) this.#player.rung = x; else this.setAttribute('rung', x); }
+  /** {rung, chosen, limit, rungs, reason, rate, leftOut}; null without a ladder. */
+  get ladder() { return this.#player?.rungState ?? null; }
   get volume() { return this.#player?.sound.volume ?? 1; }
   set volume(x) { if (this.#player) this.#player.sound.volume = x; }
   get duration() { return this.#player?.duration ?? 0; }

@@ -87,6 +87,9 @@ export class Pace {
 
   get fps() { return this.frameMs ? 1000 / this.frameMs : 0; }
 
+  /** Whether fewer pixels cannot, or would not, make frames faster. */
+  stuck(now) { return this.scale <= SCALE_MIN || now - this.#rest < MEMORY; }
+
   /** A frame took `ms`, drawn at the present scale unless `fixed`; `now` in ms. */
   frame(ms, now, fixed = false) {
     // The first frame after a change still has the previous resolution.

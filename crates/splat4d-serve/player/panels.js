@@ -50,6 +50,9 @@ export function viewPanel(ui) {
     colors: v === OFF + OFF, only: v.startsWith(OFF) ? null : player.meta.labels[+v],
   }));
   const labelsField = field('Labels', labels);
+  const rung = choice('Bit rate', [], k => { player.rung = k; });
+  const rungField = field('Bit rate', rung);
+  let rungs = null;
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
   const figures = h('input', { type: 'checkbox', 'aria-label': 'Statistics',
     onchange: () => ui.setFigures(figures.checked) });
@@ -61,7 +64,7 @@ export function viewPanel(ui) {
     h('div', { class: 'field cramped' }, channel),
     path,
     field('Speed', speed, 'narrow'), field('Loop', loop, 'narrow'), field('Resolution', scale),
-    labelsField, field('Background', ground), field('Theme', theme), field('Renderer', backend), field('Statistics', figures),
+    rungField, labelsField, field('Background', ground), field('Theme', theme), field('Renderer', backend), field('Statistics', figures),
     h('div', { class: 'wrap' },
       button('Save image', () => ui.screenshot(), {}, 'photo'),
       ui.page ? button('Copy link', () => ui.copyLink(), {}, 'link') : null,
@@ -82,6 +85,14 @@ export function viewPanel(ui) {
     }
     labelsField.hidden = !names.length;
     labels.value = player.labels.only !== null ? String(player.labels.only) : player.labels.colors ? OFF + OFF : OFF;
+    const steps = player.meta?.ladder ?? [];
+    if (rungs !== steps) {
+      rungs = steps;
+      rung.replaceChildren(h('option', { value: 'auto' }, 'Automatic'),
+        ...steps.map(({ rate }, k) => h('option', { value: k + 1 }, `${megabits(rate)}${k + 1 === steps.length ? ' (whole)' : ''}`)));
+    }
+    rungField.hidden = steps.length < 2;
+    rung.value = String(player.rung);
     theme.set(ui.theme);
     figures.checked = ui.figuresOn;
     for (const item of [path.children[0], path.children[1], speed, loop]) {
@@ -168,6 +179,12 @@ export function helpPage(close) {
       ...GESTURES.map(([what, does]) => h('div', { class: 'pair' }, h('dt', {}, what), h('dd', {}, does))))));
 }
 
+/** A bit rate in words. */
+export const megabits = rate => `${+(rate / 1e6).toPrecision(3)} Mbit/s`;
+
+/** Why a rung is the one that is rendered. */
+const REASONS = { start: 'start', connection: 'connection', device: 'device', pinned: 'set', whole: 'whole' };
+
 /** The figures card; refresh() reads the player's statistics. */
 export function figuresCard(player) {
   const node = h('dl', { class: 'card stats', hidden: true, 'aria-label': 'Statistics' });
@@ -180,6 +197,9 @@ export function figuresCard(player) {
       ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
       ['Image', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
       ['Rendered', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
+      ...(s.ladder ? [['Bit rate', `rung ${s.ladder.rung} of ${s.ladder.rungs} (${REASONS[s.ladder.reason]})`],
+        ['Left out', count(s.ladder.leftOut)]] : []),
+      ...(isFinite(s.megabits) && s.megabits ? [['Connection', `${s.megabits.toFixed(1)} Mbit/s`]] : []),
       ...(s.leftOut ? [['Left out', count(s.leftOut)]] : []), ['Gaussians', count(s.gaussians)], ['Read', `${bytes(s.bytesRead)} of ${bytes(s.bytesTotal)}`],
       ['First image', s.firstFrame ? `${s.firstFrame.toFixed(0)} ms` : '–'],
       ['Renderer', s.backend === 'webgpu' ? 'WebGPU' : s.backend === 'webgl2' ? 'WebGL2' : s.backend ?? '–'],

@@ -6,6 +6,8 @@ import { SPEED_RANGE, STEP_MAX } from './constants.js';
 import { Controls } from './controls.js';
 import { Cost, Pace } from './pace.js';
 import { SceneError, cutShort } from './errors.js';
+import { software } from './gl.js';
+import { Ladder, rungOf } from './ladder.js';
 import { SceneFile } from './scene-file.js';
 import { advance } from './schedule.js';
 import { Sound } from './sound.js';
@@ -71,6 +73,7 @@ export class Player extends EventTarget {
   /** {track, seconds, frozen, loop} while a path plays. */
   film = null;
   buffered = [];
+  ladder = new Ladder();
   figures = { firstFrame: 0 };
   #speed = 1;
   #pace = new Pace();
@@ -98,6 +101,7 @@ export class Player extends EventTarget {
   #frame = 0;
   #told = { time: null };
   #xr = false;
+  #pin = null;
   #starting = null;
   /** The last image of the previous scene, and its time. */
   #still = null;
@@ -193,8 +197,8 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = file;
     this.meta = file.meta;
-    if (!keep) this.labels = { colors: false, only: null };
-    if (!keep) this.sound.drop();
+    this.ladder = Object.assign(new Ladder(file.meta.ladder), { pinned: this.#pin });
+    if (!keep) Object.assign(this, { labels: { colors: false, only: null } }).sound.drop();
     this.#attach();
     this.#held = keep ? performance.now() + PATIENCE : 0;
     this.#epoch++;
@@ -237,7 +241,7 @@ export class Player extends EventTarget {
       onchange: () => { this.redraw(CONTENT); this.#bufferAt = 0; },
       onerror: error => this.#pageFailed(error),
       onleft: gaussians => this.emit('leftout', { gaussians }),
-      show: this.labels.colors || this.labels.only !== null ? this.labels : null,
+      show: this.labels.colors || this.labels.only !== null ? this.labels : null, ladder: this.ladder,
     });
   }
 
@@ -592,7 +596,7 @@ export class Player extends EventTarget {
   };
 
   #draw(now) {
-    const { waiting } = this, ready = this.#stream.ready(this.clock);
+    const { waiting } = this, ready = this.#stream.ready(this.clock, this.state === 'loading' ? 0 : undefined);
     if (this.state === 'loading') {
       if (!waiting) this.#coarseAt ||= now;
       if (waiting || (ready < 0.999 && now - this.#coarseAt < PATIENCE)) return this.emit('progress', { ready });
@@ -687,8 +691,28 @@ export class Player extends EventTarget {
   }
 
   #measure(now) {
-    if (this.#interval && this.state === 'ready') this.#pace.frame(now - this.#interval, now, this.resolution !== 'auto');
+    if (this.#interval && this.state === 'ready') {
+      const fixed = this.resolution !== 'auto';
+      this.#pace.frame(now - this.#interval, now, fixed);
+      this.frameTook(now - this.#interval, now, { stuck: fixed || this.#pace.stuck(now) });
+    }
     this.#interval = now;
+  }
+
+  /** A frame took `ms`: a device that is too slow renders a lower rung (`Ladder.frame`). */
+  frameTook(ms, now, limits) { this.ladder.frame(ms, now, this.#stream?.shown(this.time).rung ?? 0, limits); }
+
+  /** 'auto', or the rung of the ladder that alone is rendered, 1 the coarsest. */
+  get rung() { return this.#pin === null ? 'auto' : this.#pin + 1; }
+  set rung(x) { this.ladder.pinned = this.#pin = rungOf(x); this.redraw(CONTENT); }
+
+  /** What is rendered of the ladder (`Stream.rungs`); null for files without one. */
+  get rungState() { return this.#stream?.rungs(this.time) ?? null; }
+
+  #tellRung() {
+    const detail = this.rungState, what = detail && Object.values(detail).slice(0, -1).join();
+    if (what !== (this.#told.rung ?? null)) this.emit('rungchange', detail ?? {});
+    this.#told.rung = what;
   }
 
   #tellTime() {
@@ -706,21 +730,10 @@ export class Player extends EventTarget {
     }
     if (now - this.#bufferAt > BUFFER_EVERY) {
       this.#bufferAt = now;
-      this.#buffer();
+      this.buffered = this.still ? [] : this.#stream.buffered(BUFFER_POINTS);
+      this.#tellRung();
       this.emit('progress', { ready: this.#stream.ready(this.clock) });
     }
-  }
-
-  /** The spans of the clip that could be played now without waiting, as shares of it. */
-  #buffer() {
-    const out = [];
-    for (let i = 0; i < BUFFER_POINTS && !this.still; i++) {
-      const [a, b] = [i / BUFFER_POINTS, (i + 1) / BUFFER_POINTS];
-      if (!this.#stream.playable(this.first + (a + b) / 2 * this.duration)) continue;
-      if (out.at(-1)?.[1] === a) out.at(-1)[1] = b;
-      else out.push([a, b]);
-    }
-    this.buffered = out;
   }
 
   // What others may call.
@@ -757,6 +770,7 @@ export class Player extends EventTarget {
       ...this.figures, fps, frameMs, atRest: performance.now() - this.#drawnAt > 1000, ...this.backend?.stats,
       backend: this.backend?.name ?? null, width, height, scale: this.scale,
       gaussians: this.meta?.gaussians ?? 0, ready: this.ready(this.clock),
+      ladder: this.rungState, megabits: (this.file?.rate(performance.now()) ?? 0) / 1e6,
       leftOut: this.#stream?.left ?? 0, bytesRead: this.file?.bytesRead ?? 0, bytesTotal: this.file?.bytesTotal ?? 0,
     };
   }
@@ -783,10 +797,4 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = null;
   }
-}
-
-/** Whether WebGL states that it is computed on the CPU. */
-function software(gl) {
-  const asked = gl?.getExtension?.('WEBGL_debug_renderer_info');
-  return !!asked && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(asked.UNMASKED_RENDERER_WEBGL));
 }

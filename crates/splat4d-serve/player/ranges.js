@@ -2,6 +2,7 @@
 // network error), or slices of what is in memory already.
 
 import { SceneError } from './errors.js';
+import { Throughput } from './ladder.js';
 
 /// Requests at a time: what browsers open to one host over HTTP/1.1.
 const PARALLEL = 6;
@@ -41,6 +42,10 @@ export class Local {
       );
     }
   }
+  /// Bits per second: what is here needs no connection.
+  rate() {
+    return Infinity;
+  }
   close() {}
 }
 
@@ -53,13 +58,28 @@ export class Remote {
   #running = 0;
   #closed = new AbortController();
   #memory = null;
+  #throughput = new Throughput();
+
+  #observer = null;
 
   constructor(url) {
     this.url = url;
+    const name = new URL(url, globalThis.location?.href).href;
+    if (!globalThis.PerformanceObserver?.supportedEntryTypes?.includes('resource')) return;
+    this.#observer = new PerformanceObserver((list) => {
+      for (const e of list.getEntries()) {
+        // Of another origin, a server may hide the times.
+        if (e.name === name && e.encodedBodySize > 0 && e.requestStart > 0) {
+          this.#throughput.timed(e.encodedBodySize, e.requestStart, e.responseStart, e.responseEnd);
+        }
+      }
+    });
+    this.#observer.observe({ type: 'resource' });
   }
 
   /// Reads the first `length` bytes; from a server without ranges the whole. `onprogress(read, total)` then.
   async open(length, signal, onprogress) {
+    this.#throughput.begin(performance.now());
     try {
       return await this.#twice(async () => {
         const response = await this.#request(0, length, signal);
@@ -85,6 +105,8 @@ export class Remote {
           : 'Check the address and the connection. A server of another origin must allow access (CORS).',
         e,
       );
+    } finally {
+      this.#throughput.end(performance.now());
     }
   }
 
@@ -111,7 +133,13 @@ export class Remote {
     });
   }
 
+  /// Bits per second of the connection while it is busy; 0 before anything was measured.
+  rate(now) {
+    return this.#memory ? Infinity : this.#throughput.rate(now);
+  }
+
   close() {
+    this.#observer?.disconnect();
     this.#closed.abort();
     for (const job of this.#queue.splice(0)) if (!job.done) job.leave();
   }
@@ -146,6 +174,7 @@ export class Remote {
     const leave = () => stop.abort();
     this.#closed.signal.addEventListener('abort', leave);
     for (const job of run) job.stop = () => run.every((j) => j.done) && stop.abort();
+    this.#throughput.begin(performance.now());
     try {
       await this.#twice(async () => {
         const open = run.filter((j) => !j.done);
@@ -181,6 +210,7 @@ export class Remote {
         }
       }
     } finally {
+      this.#throughput.end(performance.now());
       this.#closed.signal.removeEventListener('abort', leave);
     }
   }
@@ -223,6 +253,7 @@ export class Remote {
       const { done, value } = await reader.read();
       if (done) return bytes.subarray(0, n);
       this.bytesRead += value.length;
+      this.#throughput.add(value.length, performance.now());
       const more = limit ? value.subarray(0, limit - n) : value;
       if (n + more.length > bytes.length) {
         const grown = new Uint8Array(Math.max(n + more.length, 2 * bytes.length));

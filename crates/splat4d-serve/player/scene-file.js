@@ -157,6 +157,11 @@ export class SceneFile {
     return this.#source.bytesRead;
   }
 
+  /// Bits per second of its connection; 0 before anything was measured, Infinity where all of it is in memory.
+  rate(now) {
+    return this.#source.rate(now);
+  }
+
   /// Length of the file, bytes.
   bytesTotal = 0;
   /// Bytes that the file states it has: more than there are where it was cut short.
@@ -435,6 +440,7 @@ export class SceneFile {
       view: look(j.view) ? j.view : null,
       cameras,
       labels: list(j.labels).filter((name) => typeof name === 'string').slice(0, 255),
+      ladder: ladder(j.ladder),
       missing: list(j.missing).filter((span) => numbers(span, 2) && span[0] < span[1]),
       near: nears.length ? Math.min(...nears) : NEAR,
       path: list(j.path)
@@ -461,6 +467,16 @@ const camera = (v) =>
   number(v.cx) &&
   number(v.cy) &&
   [v.width, v.height, v.fx, v.fy].every((n) => number(n) && n > 0);
+
+/// Rungs with rising rates and tiers; none where they are not.
+function ladder(v) {
+  const rungs = list(v).map((r) => ({ rate: r?.rate, tiers: r?.tiers }));
+  const rises = rungs.every(({ rate, tiers }, k) => {
+    const last = rungs[k - 1] ?? { rate: 0, tiers: 0 };
+    return number(rate) && Number.isInteger(tiers) && rate > last.rate && tiers > last.tiers;
+  });
+  return rises ? rungs : [];
+}
 
 /// A u64, as a float: beyond 2⁵³ it is no length that exists, and fails the comparison with what is there.
 function long(view, at) {

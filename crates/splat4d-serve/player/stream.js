@@ -1,8 +1,10 @@
 // Keeps the right pages in a backend: first those of this time (most important tier first), then those just ahead;
-// above its budget it drops the pages farthest in time, never of what this time needs.
+// above its budget it drops the pages farthest in time, never of what this time needs. Of a file with a bitrate ladder,
+// pages of the rung that `ladder.js` chooses: the coarsest rung first, those of higher rungs while the connection is idle.
 
 import { isAbort } from './errors.js';
 import { painted } from './labels.js';
+import { Ladder } from './ladder.js';
 
 /// Bytes of 32-bit words that stay resident, by default, and on small machines (navigator.deviceMemory, GiB).
 const BUDGET = 512 << 20,
@@ -20,6 +22,12 @@ const AHEAD = 2,
 const STEP = 8;
 /// Pages in flight for later: few, so that a seek is not behind many.
 const LATER = 4;
+/// While coarse pages with more bytes than this are on their way, no finer ones of their time are: they would share the line.
+const HEAVY = 256 << 10;
+/// The throughput of the connection is examined at this interval, ms.
+const STEER = 200;
+/// Pages of higher rungs in flight while the connection is idle.
+const IDLE = 2;
 /// A page is tried this often; after the last failure it rests, ms.
 const TRIES = 2,
   REST = 10_000;
@@ -56,7 +64,10 @@ export class Stream {
   #ended = -1;
   /// When a page that was given up may be tried again.
   #again = Infinity;
-  #last = { time: NaN, active: null, step: NaN, playing: false, speed: 1, loop: true };
+  #last = { time: NaN, active: null, step: NaN, playing: false, speed: 1, loop: true, tiers: 0, cap: 0 };
+  /// Pages of this time and of later ones beyond the chosen rung: loaded while the connection is idle.
+  #more = [];
+  #steered = -Infinity;
   #waiting = [];
   #over = false;
   #starts;
@@ -68,17 +79,21 @@ export class Stream {
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
   /// `onchange()` after each page that was added or dropped, `onerror(SceneError)` for a page that is given up for now,
   /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` needs it, null:
-  /// pages are shown unchanged.
-  constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
+  /// pages are shown unchanged. `ladder`: the choice of the rung, which outlives a stream.
+  constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null, ladder } = {}) {
     this.#show = show;
+    this.ladder = ladder ?? new Ladder(file.meta.ladder);
     this.#file = file;
     this.#backend = backend;
     this.#budget = Math.min(budget, backend.capacity ?? Infinity);
     this.#onchange = onchange ?? (() => {});
     this.#onerror = onerror ?? (() => {});
     this.#onleft = onleft ?? (() => {});
-    const coarsest = new Map();
+    const coarsest = new Map(),
+      first = this.ladder.tiers(0);
     for (const { from, to, tier } of file.pages) {
+      // A span that has nothing in the lowest rung is not waited for.
+      if (tier >= first) continue;
       const span = `${from} ${to}`;
       coarsest.set(span, Math.min(tier, coarsest.get(span) ?? tier));
     }
@@ -113,25 +128,73 @@ export class Stream {
     // Later times are examined again in coarse steps only.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const step = Math.floor((t / reach) * STEP);
-    const last = this.#last;
+    const last = this.#last,
+      now = performance.now();
     last.time = t;
-    const same = last.active === active && last.step === step && last.playing === playing;
-    if (same && last.speed === speed && last.loop === loop && performance.now() < this.#again) return;
-    Object.assign(last, { active, step, playing, speed, loop });
+    if (now - this.#steered >= STEER) {
+      this.#steered = now;
+      // The time before the first image is no waiting: nothing is late yet.
+      const waiting = playing && this.#resident.size > 0 && !this.playable(t);
+      this.ladder.steer(now, { rate: this.#file.rate?.(now) ?? Infinity, speed: playing ? speed : 1, waiting });
+    }
+    const tiers = this.ladder.tiers(this.ladder.wanted),
+      cap = this.ladder.tiers(this.ladder.cap);
+    const rung = last.tiers === tiers && last.cap === cap;
+    const same = rung && last.active === active && last.step === step && last.playing === playing;
+    if (same && last.speed === speed && last.loop === loop && now < this.#again) return;
+    Object.assign(last, { active, step, playing, speed, loop, tiers, cap });
     this.#again = Infinity;
     this.#plan(t, playing, speed, loop, reach);
     this.#pump();
   }
 
-  /// Share of the Gaussians of `time` that are resident, 0 to 1.
-  ready(time) {
+  /// Share of the Gaussians of `time` that are resident, 0 to 1; of the rung that is loaded, or of rung `k`.
+  ready(time, k = this.ladder.wanted) {
+    const tiers = this.ladder.tiers(this.ladder.pinned ?? k);
     let all = 0,
       there = 0;
     for (const page of this.#pagesOf(time)) {
+      if (page.tier >= tiers) continue;
       all += page.count;
       if (this.#resident.has(page.id)) there += page.count;
     }
     return all ? there / all : 1;
+  }
+
+  /// The highest rung of which all pages of `time` are resident, -1: none; and the Gaussians of `time` that are not.
+  shown(time) {
+    let [left, first] = [0, Infinity];
+    for (const page of this.#pagesOf(time)) {
+      if (this.#resident.has(page.id)) continue;
+      left += page.count;
+      first = Math.min(first, page.tier);
+    }
+    return { rung: this.ladder.rungs.findLastIndex((r) => r.tiers <= first), left };
+  }
+
+  /// The ladder at `time`, rungs counted from 1: {rung: of what is resident, 0: none is complete; chosen: loaded first;
+  /// limit: by the device; rungs; reason; rate: of the chosen one, Mbit/s; leftOut: Gaussians that are not resident}; null
+  /// for a file without a ladder.
+  rungs(time) {
+    const { ladder } = this;
+    if (!this.#file.meta.ladder?.length) return null;
+    const { rung, left } = this.shown(time),
+      rate = ladder.rungs[ladder.wanted].rate / 1e6;
+    const [chosen, limit] = [ladder.wanted + 1, ladder.cap + 1];
+    return { rung: rung + 1, chosen, limit, rungs: ladder.length, reason: ladder.reason, rate, leftOut: left };
+  }
+
+  /// The spans of the clip that could be played now without waiting, as shares of it, from `points` samples.
+  buffered(points) {
+    const [first, last] = this.#file.meta.clip,
+      out = [];
+    for (let i = 0; i < points; i++) {
+      const [a, b] = [i / points, (i + 1) / points];
+      if (!this.playable(first + ((a + b) / 2) * (last - first))) continue;
+      if (out.at(-1)?.[1] === a) out.at(-1)[1] = b;
+      else out.push([a, b]);
+    }
+    return out;
   }
 
   /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the
@@ -169,12 +232,23 @@ export class Stream {
   /// Decides what should be resident: `#now` and `#later`, both in the order in which they are needed, within budget.
   #plan(t, playing, speed, loop, reach) {
     const [first, last] = this.#file.meta.clip;
+    const { tiers, cap } = this.#last,
+      base = this.ladder.length > 1 ? this.ladder.tiers(this.ladder.pinned ?? 0) : Infinity;
     const now = [],
-      later = [];
+      later = [],
+      more = [];
     const forward = speed >= 0;
     for (const page of this.#file.pages) {
+      if (page.tier >= cap) {
+        // Above the rung that the device can render, or that is pinned.
+        if (this.#resident.has(page.id)) this.#drop(page);
+        continue;
+      }
       if (page.from <= t && t < page.to) {
-        now.push(page);
+        page.wait = 0;
+        // While it plays, the lowest rung of what is next goes before more of what is rendered already.
+        if (page.tier < tiers && (page.tier < base || !playing)) now.push(page);
+        else (page.tier < tiers ? later : more).push(page);
         continue;
       }
       // How long until it is needed, on the scene clock; while nothing plays, either way.
@@ -185,10 +259,12 @@ export class Stream {
         if (wait < 0) wait = loop ? Math.max(round, 0) : Infinity;
       }
       page.wait = wait;
-      if (wait <= reach) later.push(page);
+      if (wait <= reach) (page.tier < tiers ? later : more).push(page);
     }
+    const coarse = (page) => (page.tier < base ? 0 : 1);
     now.sort((a, b) => a.tier - b.tier || a.id - b.id);
-    later.sort((a, b) => a.wait - b.wait || a.tier - b.tier || a.id - b.id);
+    later.sort((a, b) => coarse(a) - coarse(b) || a.wait - b.wait || a.tier - b.tier || a.id - b.id);
+    more.sort((a, b) => a.wait - b.wait || a.tier - b.tier || a.id - b.id);
     let room = this.#budget;
     const fits = (page) => (cost(page) <= room ? ((room -= cost(page)), true) : false);
     this.#now = now.filter(fits);
@@ -199,15 +275,28 @@ export class Stream {
     this.left = left;
     // What is later may not push out more of itself than the budget has left.
     this.#later = later.filter(fits);
-    const wanted = new Set([...this.#now, ...this.#later].map((p) => p.id));
-    for (const [id, stop] of this.#flight) if (!wanted.has(id)) stop.abort();
+    this.#more = more.filter(fits);
+    const needed = [...this.#now, ...this.#later],
+      wanted = new Set([...needed, ...this.#more].map((p) => p.id));
+    // What is not needed yet gives way to what is missing.
+    const busy = needed.some((page) => !this.#resident.has(page.id)),
+      kept = busy ? new Set(needed.map((p) => p.id)) : wanted;
+    for (const [id, stop] of this.#flight) if (!kept.has(id)) stop.abort();
     this.#shrink(wanted);
+  }
+
+  #drop(page) {
+    this.#resident.delete(page.id);
+    this.#masked.delete(page.id);
+    this.#bytes -= cost(page);
+    this.#backend.dropPage(page.id);
+    this.#onchange();
   }
 
   /// Drops pages until what is needed fits: the farthest in time first.
   #shrink(wanted) {
     let missing = 0;
-    for (const page of [...this.#now, ...this.#later]) {
+    for (const page of [...this.#now, ...this.#later, ...this.#more]) {
       if (!this.#resident.has(page.id)) missing += cost(page);
     }
     if (this.#bytes + missing <= this.#budget) return;
@@ -222,11 +311,7 @@ export class Stream {
     spare.sort((a, b) => far(b) - far(a) || b.tier - a.tier || b.id - a.id);
     for (const page of spare) {
       if (this.#bytes + missing <= this.#budget) break;
-      this.#resident.delete(page.id);
-      this.#masked.delete(page.id);
-      this.#bytes -= cost(page);
-      this.#backend.dropPage(page.id);
-      this.#onchange();
+      this.#drop(page);
     }
   }
 
@@ -241,13 +326,22 @@ export class Stream {
   #pump() {
     if (this.#over) return;
     let open = false;
+    const missing = this.#now.filter((page) => this.#coarse.has(page.id) && (this.#flight.has(page.id) || this.#wants(page)));
+    const heavy = missing.reduce((n, page) => n + (page.stored ?? 0), 0) > HEAVY;
     for (const page of this.#now) {
+      if (heavy && !this.#coarse.has(page.id)) continue;
       if (this.#wants(page)) this.#load(page);
       open ||= this.#flight.has(page.id);
     }
     if (!open) {
       for (const page of this.#later) {
         if (this.#flight.size >= LATER) break;
+        if (this.#wants(page)) this.#load(page);
+      }
+    }
+    if (!this.#flight.size || this.#more.some((page) => this.#flight.has(page.id))) {
+      for (const page of this.#more) {
+        if (this.#flight.size >= IDLE) break;
         if (this.#wants(page)) this.#load(page);
       }
     }
@@ -314,10 +408,11 @@ export class Stream {
     return there;
   }
 
-  /// Resolves `settled` when nothing of this time is being loaded.
+  /// Resolves `settled` when nothing of this time is being loaded, of any rung that may be rendered.
   #wake() {
     if (!this.#waiting.length) return;
-    if (this.#now.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;
+    const active = [...this.#now, ...[...this.#later, ...this.#more].filter((page) => page.wait === 0 && this.#active.includes(page))];
+    if (active.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;
     for (const done of this.#waiting.splice(0)) done();
   }
 }

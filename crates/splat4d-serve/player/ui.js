@@ -2,7 +2,7 @@
 
 import { SPEED_RANGE } from './constants.js';
 import { CHANNELS } from './player.js';
-import { CHANNEL_NAMES, SPEEDS, cameraPanel, figuresCard, helpPage, readPath, viewPanel } from './panels.js';
+import { CHANNEL_NAMES, SPEEDS, cameraPanel, figuresCard, helpPage, megabits, readPath, viewPanel } from './panels.js';
 import { button, bytes, choice, clock, h, pick, retool, save, segments, shown, tool } from './dom.js';
 import { clamp } from './camera.js';
 import { icon } from './icons.js';
@@ -148,6 +148,7 @@ export class Interface {
     on('error', e => this.#error(e.detail.error));
     on('leftout', e => this.quiet || this.toast(
       `Too large for this device: ${e.detail.gaussians.toLocaleString('en-GB')} Gaussians of least importance are left out`, 3 * TOAST));
+    on('rungchange', e => this.#rungChanged(e.detail));
     on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
@@ -220,6 +221,17 @@ export class Interface {
     for (const panel of Object.values(this.panels)) panel.refresh();
     if (!this.#panel) this.wake();
   }
+
+  /** Reports that less than the whole is rendered, and why; not that it is more again. */
+  #rungChanged({ limit, chosen, rungs, reason, rate }) {
+    const least = Math.min(limit ?? Infinity, chosen ?? Infinity);
+    if (least < this.#least && ['device', 'connection'].includes(reason) && !this.quiet) {
+      this.toast(`${reason === 'device' ? 'Slow device' : 'Slow connection'}: bit rate ${least} of ${rungs}, ${megabits(1e6 * rate)}`, 2 * TOAST);
+    }
+    this.#least = least;
+    this.panels.view.refresh();
+  }
+  #least = 0;
 
   /** Distances that the depth view's brightness represents. */
   #showScale() {

@@ -30,6 +30,8 @@ export function eyeView(eye, start, unit, width, height) {
 
 /** Where a device does not report its floor, this far below it, metres: it is held before a standing person. */
 const FLOOR = -1.4;
+/** Frames per second of headsets that do not state them. */
+const RATE = 72;
 /** Initial distance of a scene in the room, metres. */
 const AHEAD = 1.2;
 
@@ -98,6 +100,9 @@ export async function enter(player, mode = 'immersive-vr') {
   const tick = (now, frame) => {
     session.requestAnimationFrame(tick);
     player.advance(Math.min((now - last) / 1000, 0.1));
+    // A headset that misses two of three frames is too slow for the rung; fewer pixels are not tried there.
+    const period = 1000 / (session.frameRate || RATE);
+    if (last) player.frameTook(now - last, now, { slow: 1.5 * period, fast: 1.15 * period });
     last = now;
     const viewer = frame.getViewerPose(space);
     if (viewer && standing && !standing.placed) standing.ahead(viewer.transform);

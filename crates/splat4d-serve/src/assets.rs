@@ -35,6 +35,7 @@ const FILES: &[(&str, &str)] = player![
     "icons.js",
     "index.html",
     "labels.js",
+    "ladder.js",
     "live.js",
     "order.js",
     "pace.js",

@@ -87,6 +87,8 @@ pub struct Baking {
     /// Most entries of the palette.
     pub palette: usize,
     pub poster: bool,
+    /// Rates of a bitrate ladder, Mbit/s, rising; empty: none.
+    pub ladder: Vec<f64>,
     /// What is heard; only [`bake`](fn@bake) uses it.
     pub sound: SoundChoice,
     /// When it is to be done.
@@ -101,6 +103,7 @@ impl Default for Baking {
             bytes: None,
             palette: WriteConfig::default().palette,
             poster: true,
+            ladder: Vec::new(),
             sound: SoundChoice::Kept,
             deadline: Deadline::default(),
         }
@@ -230,7 +233,12 @@ impl Kitchen<'_> {
             nodes: std::mem::take(&mut baked.nodes),
             poster,
         };
-        let config = WriteConfig { palette: baking.palette, ..WriteConfig::default() };
+        let config = WriteConfig {
+            palette: baking.palette,
+            ladder: baking.ladder.iter().map(|rate| ladder::MEGA * rate).collect(),
+            later: self.source.sound.as_ref().map_or(0, |s| s.mp4.len() as u64),
+            ..WriteConfig::default()
+        };
         let mut bytes = Vec::new();
         let summary = playback::write(&draft, &config, &mut bytes)?;
         let at = price.zip(curve).map(|(price, curve)| (price, curve.at(price)));
@@ -253,6 +261,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
             .at(out.display())
             .remedy("Use option `output` NAME.s4d."));
     }
+    ladder::check(&baking.ladder)?;
     let mut source = Source::open(from)?;
     not_empty(&source.scene, from)?;
     let read = if let SoundChoice::File(file) = &baking.sound { vec![file.as_path()] } else { Vec::new() };
@@ -270,15 +279,32 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
     Ok(value)
 }
 
+/// Bytes of a file that uses the highest rate of a ladder; none without one, or where [`budget`] is more.
+fn highest(scene: &Scene<f32>, baking: &Baking) -> Option<u64> {
+    let frame = if scene.fps > 0.0 && scene.fps.is_finite() { 1.0 / scene.fps } else { 0.0 };
+    let seconds = (scene.clip[1] - scene.clip[0] + frame) * baking.options.repeat as f64;
+    let bytes = (baking.ladder.last()? * ladder::MEGA / 8.0 * seconds.max(1.0)) as u64;
+    Some(bytes.max(budget(scene)))
+}
+
 /// Bakes into the file `out` and states how well; returns the report. The options' cameras are the source's.
 pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, console: &dyn Listener) -> Result<Value> {
     let started = baking.deadline.now();
+    ladder::check(&baking.ladder)?;
+    let bytes = baking.bytes.or_else(|| highest(&source.scene, baking));
+    let peel = baking.options.peel || !baking.ladder.is_empty();
+    let baking = &Baking { bytes, options: Options { peel, ..baking.options.clone() }, ..baking.clone() };
     let baking = &Baking { bytes: sound::left(source.sound.as_ref(), baking.bytes)?, ..baking.clone() };
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
     let Packed { mut bytes, baked, summary, antialias, .. } = packed;
     if source.provenance.is_some() || source.sound.is_some() {
         bytes = playback::with_extras(&bytes, source.provenance.as_ref(), source.sound.as_ref())?;
     }
+    let rungs = if baking.ladder.is_empty() {
+        Vec::new()
+    } else {
+        ladder::report(&bytes, &compared(source)?, &baking.deadline, console)?
+    };
     files::write(out, &bytes)?;
     let seconds = baking.deadline.now() - started;
     console.clear();
@@ -289,7 +315,7 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         .iter()
         .map(|(name, e)| ((*name).to_owned(), json!({"rms": e.rms, "max": e.max})))
         .collect();
-    let value = json!({
+    let mut value = json!({
         "type": "baked", "file": out.to_string_lossy(), "bytes": bytes.len(), "seconds": seconds, "clip": baked.clip,
         "bytes_per_primitive": summary.bytes as f64 / report.primitives.max(1) as f64,
         "pages": summary.pages, "page_bytes": summary.page_bytes, "palette_entries": summary.palette_entries,
@@ -297,7 +323,12 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         "sound_bytes": source.sound.as_ref().map_or(0, |s| s.mp4.len()),
         "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
+    if !rungs.is_empty() {
+        value["ladder"] = json!(rungs);
+    }
     print_summary(report, likeness.as_ref(), summary.bytes, seconds, console);
+    ladder::in_words(&rungs).iter().for_each(|line| console.result(line));
+    ladder::notes(&rungs, &baking.ladder).iter().for_each(|line| console.result(line));
     if let Some(sound) = &source.sound {
         console.result(&format!("sound: {}", sound::in_words(sound)));
     }
@@ -624,5 +655,6 @@ pub fn title(source: &Source, path: &Path) -> String {
     source.run.as_ref().map_or_else(stem, Run::name)
 }
 
+pub(crate) mod ladder;
 #[cfg(test)]
 mod tests;

@@ -14,6 +14,7 @@ Examples:
   splat4d bake runs/knight -o small.s4d --size 4MB    motion is split as finely as that allows
   splat4d bake runs/knight -o tight.s4d --tolerance 0.1
   splat4d bake runs/knight -o long.s4d --repeat 20    repeat the clip twenty times
+  splat4d bake runs/dance -o dance.s4d --ladder 8,20,75  the player chooses by the connection and the device
 
 `train` does this at its end: the file is RUN/scene.s4d.";
 
@@ -34,6 +35,10 @@ pub(crate) struct Args {
     /// Split every segment that misses by more pixels of the capture's cameras, without a size limit
     #[arg(long, value_name = "PX", conflicts_with = "size")]
     tolerance: Option<f64>,
+    /// Bitrate ladder: nested parts of the file that stay within these rates, rising; the player chooses one by the
+    /// connection and the device
+    #[arg(long, value_name = "MBIT/S,...", value_delimiter = ',')]
+    ladder: Vec<f64>,
     /// Approximate seconds that a seek loads
     #[arg(long, value_name = "S", default_value_t = SEGMENT)]
     segment: f64,
@@ -72,6 +77,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         bytes: args.size,
         palette: args.palette,
         poster: !args.no_poster,
+        ladder: args.ladder.clone(),
         sound: match &args.sound {
             None => SoundChoice::Kept,
             Some(none) if none.as_os_str() == "none" => SoundChoice::None,

@@ -6,13 +6,30 @@ import path from 'node:path';
 import { fileURLToPath } from 'node:url';
 
 export const PLAYER = fileURLToPath(new URL('../../player/', import.meta.url));
+/// Bytes that a slow line sends at a time, and how late a busy machine may be, ms.
+const PIECE = 8192,
+  LATE = 200;
 const TYPES = { '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.css': 'text/css' };
 
 /// Serves `files` (name → bytes or text) and the folders in `folders` (prefix → folder; the player is at /player/).
 /// `ranges: false`: a server without ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
-/// the connection. Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
-export async function serve({ files = {}, folders = {}, ranges = true, delay = 0, fail = () => false } = {}) {
-  const state = { log: [], sent: 0, options: { ranges, delay, fail } };
+/// the connection. `rate`: bits per second of all scenes together, 0: unlimited; it may be changed while the server runs
+/// (`options.rate`). Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
+export async function serve({ files = {}, folders = {}, ranges = true, delay = 0, fail = () => false, rate = 0 } = {}) {
+  const state = { log: [], sent: 0, options: { ranges, delay, fail, rate } };
+  let free = 0;
+  /// Writes a body piece by piece, when the line is free.
+  const slowly = async (response, body) => {
+    for (let at = 0; at < body.length && !response.destroyed; at += PIECE) {
+      const piece = body.subarray(at, at + PIECE),
+        now = performance.now();
+      // What a late timer costs is caught up with: the line itself is not slower.
+      free = Math.max(free, now - LATE) + (8000 * piece.length) / state.options.rate;
+      await new Promise((done) => setTimeout(done, free - now));
+      response.write(piece);
+    }
+    response.end();
+  };
   const roots = { '/player/': PLAYER, ...folders };
   const server = http.createServer(async (request, response) => {
     const name = decodeURIComponent(new URL(request.url, 'http://x').pathname),
@@ -58,7 +75,9 @@ export async function serve({ files = {}, folders = {}, ranges = true, delay = 0
     state.log.push({ url: name, from, to, status });
     state.sent += to - from + 1;
     response.writeHead(status, headers);
-    if (file) createReadStream(file, { start: from, end: to }).pipe(response);
+    const scene = body !== null && options.rate && name.endsWith('.s4d');
+    if (scene) slowly(response, Buffer.from(body).subarray(from, to + 1));
+    else if (file) createReadStream(file, { start: from, end: to }).pipe(response);
     else response.end(Buffer.from(body).subarray(from, to + 1));
   });
   await new Promise((done) => server.listen(0, '127.0.0.1', done));

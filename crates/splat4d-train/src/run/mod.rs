@@ -12,6 +12,7 @@ mod flows;
 mod identity;
 mod info;
 mod left;
+mod measured;
 mod memory;
 mod metrics;
 mod minutes;

@@ -269,7 +269,13 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
 }
 
 /// Renders a training frame with its depth.
-fn draw(scene: &Scene<f32>, opened: &OpenCapture, i: usize, renderer: &mut Renderer<f32>, out: &mut Image<f32>) {
+pub(super) fn draw(
+    scene: &Scene<f32>,
+    opened: &OpenCapture,
+    i: usize,
+    renderer: &mut Renderer<f32>,
+    out: &mut Image<f32>,
+) {
     let mut instant = Evaluation::default();
     scene.at(opened.frames.time(i), &mut instant);
     let splats = scene.splats(&instant);

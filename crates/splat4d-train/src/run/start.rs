@@ -7,6 +7,7 @@ use super::count::settled;
 use super::flows;
 use super::identity::identity;
 use super::info::{read_info, read_text};
+use super::measured;
 use super::memory::memory_estimate;
 use super::minutes::Timing;
 use super::open::{OpenCapture, check_flow, open_capture};
@@ -61,6 +62,7 @@ pub fn train(
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let opened = points::complete(opened, &recipe, run, &mut listen)?;
     let opened = flows::complete(opened, &recipe, run, &mut listen)?;
+    measured::before(&opened)?;
     let (opened, unfitted) = aligned(opened, &recipe)?;
     let (opened, warning) = priors::believed(opened, &recipe)?;
     for message in priors::before(&opened, &recipe)?.into_iter().chain(early).chain(unfitted).chain(warning) {

@@ -142,3 +142,50 @@ fn a_file_without_a_visible_gaussian_is_written_with_a_warning() {
     assert_eq!(report["baking"]["primitives"], 0);
     assert!(playback::read(&std::fs::read(&out).unwrap()).is_ok());
 }
+
+#[test]
+fn a_ladder_is_reported_rung_by_rung_and_stated_in_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("ladder.s4d");
+    let baking = Baking { poster: false, ladder: vec![0.4, 50.0], ..Baking::default() };
+    let said = std::cell::RefCell::new(String::new());
+    let listen = |event: &crate::events::Event<'_>| {
+        if let crate::events::Event::Result(text) = event {
+            said.borrow_mut().push_str(text);
+        }
+    };
+    let report = bake_into(&source(&Leaps::default()), "ladder", &out, &baking, &listen).unwrap();
+    let rungs = report["ladder"].as_array().unwrap();
+    assert_eq!(rungs.len(), 2, "{report:#}");
+    let number = |k: usize, key: &str| rungs[k][key].as_f64().unwrap();
+    assert!(number(0, "most") <= 0.4 && number(0, "rate") == 0.4, "{report:#}");
+    assert!(number(0, "gaussians") < number(1, "gaussians") && number(0, "bytes") < number(1, "bytes"));
+    assert_eq!(number(1, "gaussians"), report["baking"]["primitives"].as_f64().unwrap());
+    assert!(number(0, "psnr") > 5.0 && number(0, "psnr") < 60.0 && rungs[1]["psnr"].is_null());
+    assert!(number(0, "bits_a_gaussian") > 100.0, "{report:#}");
+    assert!(said.borrow().contains("rung 1 of 2: 0.40 Mbit/s"), "{}", said.borrow());
+    let index = playback::Index::parse(&std::fs::read(&out).unwrap(), None).unwrap();
+    assert_eq!(ladder::in_words(&ladder::rungs(&index)).len(), 2);
+    let wrong = Baking { ladder: vec![8.0, 4.0], ..Baking::default() };
+    let error = bake_into(&source(&Leaps::default()), "wrong", &out, &wrong, &ignore).unwrap_err().to_string();
+    assert!(error.contains("invalid ladder 8,4"), "{error}");
+}
+
+/// Rungs of the file that SCENE names at the rates of LADDER (Mbit/s), ranked once and round by round.
+#[test]
+#[ignore = "a study: studies/records/2026-11-28-ladder.md"]
+fn rungs_ranked_once_and_round_by_round() {
+    let [scene, rates] = ["SCENE", "LADDER"].map(|name| std::env::var(name).expect("SCENE and LADDER are set"));
+    let source = Source::open(Path::new(&scene)).unwrap();
+    let ladder: Vec<f64> = rates.split(',').map(|rate| rate.parse().unwrap()).collect();
+    for peel in [false, true] {
+        let options = Options { peel, ..Options::default() };
+        let baking = Baking { options, ladder: ladder.clone(), bytes: Some(1 << 30), ..Baking::default() };
+        let began = std::time::Instant::now();
+        let cooked = bake_like(&source, "study", &baking, &ignore).unwrap();
+        let seconds = began.elapsed().as_secs_f64();
+        let bytes = &cooked.packed.bytes;
+        let rungs = ladder::report(bytes, &compared(&source).unwrap(), &baking.deadline, &ignore).unwrap();
+        println!("round by round: {peel}, {seconds:.1} s\n{}", ladder::in_words(&rungs).join("\n"));
+    }
+}

@@ -1,6 +1,7 @@
 //! Content of a playback file's index: sections, sizes, and the bytes that a player needs before the first frame.
 
 use super::line;
+use crate::baking::ladder;
 use crate::files::{grouped, human_bytes};
 use serde_json::{Value, json};
 use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind, MAGIC, strict};
@@ -70,13 +71,17 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
     if let Some(rate) = rate {
         line(&mut text, "stream", &format!("{rate:.1} Mbit/s over {seconds:.3} s"));
     }
+    let rungs = ladder::rungs(index);
+    for (i, words) in ladder::in_words(&rungs).iter().enumerate() {
+        line(&mut text, if i == 0 { "ladder" } else { "" }, words);
+    }
     let moments = moments(index);
     for (i, m) in moments.iter().enumerate() {
         let name = if i == 0 { "at" } else { "" };
         let what = format!("{} Gaussians in {} pages, {}", grouped(m.gaussians), m.pages, human_bytes(m.bytes));
         line(&mut text, name, &format!("{:>8.3} s  {what}", m.time));
     }
-    let json = json!({
+    let mut json = json!({
         "version": index.version, "meta": meta, "sections": sections.iter().map(section).collect::<Vec<_>>(),
         "page_bytes": sizes[0].1, "palette_bytes": sizes[1].1, "poster_bytes": sizes[2].1, "mask_bytes": sizes[3].1,
         "sound_bytes": sizes[5].1, "index_bytes": head,
@@ -84,6 +89,9 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
         "moments": moments.iter().map(|m| json!({"time": m.time, "gaussians": m.gaussians, "pages": m.pages,
             "bytes": m.bytes})).collect::<Vec<_>>(),
     });
+    if !rungs.is_empty() {
+        json["ladder"] = json!(rungs);
+    }
     IndexSummary { text, json }
 }
 

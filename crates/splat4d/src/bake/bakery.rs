@@ -2,7 +2,7 @@
 
 use super::fit::{Fitter, Piece, Subject, seen};
 use super::life::Lives;
-use super::rank::rank;
+use super::rank::{peel, rank};
 use super::rate::{PRICES, Rate, Sums, price};
 use super::repeat::Rounds;
 use super::sample::{self, Framed, Row, Samples};
@@ -269,8 +269,10 @@ impl<'a> Bakery<'a> {
             cut(Node { from: tree.border(span[0]), to: tree.border(span[1]), primitives }, tally.windows[window])
         };
         let mut nodes = in_order(spans.into_iter().filter_map(node).chain(pages).collect());
-        if options.rank {
-            rank(&mut nodes, self.scene, options);
+        match (options.rank, options.peel) {
+            (true, true) => peel(&mut nodes, self.scene, options),
+            (true, false) => rank(&mut nodes, self.scene, options),
+            (false, _) => {}
         }
         let mut clip = self.scene.clip;
         if options.repeat > 1 {

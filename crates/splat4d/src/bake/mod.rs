@@ -78,6 +78,9 @@ pub struct Options {
     pub path: Vec<(f64, Camera)>,
     /// Whether renders decide which Gaussians come first in a file, and not their sizes alone.
     pub rank: bool,
+    /// Whether what is left when the least important ones are left out is ranked again, for files that are played in
+    /// part.
+    pub peel: bool,
 }
 
 impl Default for Options {
@@ -92,6 +95,7 @@ impl Default for Options {
             cameras: Vec::new(),
             path: Vec::new(),
             rank: true,
+            peel: false,
         }
     }
 }

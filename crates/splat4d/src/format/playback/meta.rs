@@ -1,5 +1,6 @@
 //! The JSON of a playback file.
 
+use super::{Rung, ladder};
 use crate::layers::{Head, Layer, Scene};
 use crate::math::Se3;
 use crate::scene::features::MOST_CHANNELS;
@@ -52,6 +53,9 @@ pub struct Meta {
     /// Least and greatest number of each feature channel, between which pages count in steps.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub features: Vec<[f32; 2]>,
+    /// Rungs of a bitrate ladder, the coarsest first; the last one has everything.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub ladder: Vec<Rung>,
     /// Of a file that grows: the parts that are in it, as their maker names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parts: Vec<String>,
@@ -195,6 +199,9 @@ impl Meta {
         }
         if self.bounds.is_some_and(|b| !finite(b.as_flattened())) {
             return wrong("`box` is not finite");
+        }
+        if !ladder::is_ladder(&self.ladder) {
+            return wrong("`ladder` is not a list of rungs with rising rates and tiers");
         }
         let sound = |[low, high]: &[f32; 2]| low.is_finite() && high.is_finite() && low <= high;
         if self.features.len() > MOST_CHANNELS || !self.features.iter().all(sound) {

@@ -101,7 +101,8 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
     }
     let gaussians = draft.layers.iter().map(|l| l.params.len()).sum();
     let sh_degree = draft.palette.map_or(0, |p| p.degree);
-    let meta = Meta { gaussians, sh_degree, ..draft.meta.clone() };
+    // Rates of a ladder belong to the pages that they were measured of.
+    let meta = Meta { gaussians, sh_degree, ladder: Vec::new(), ..draft.meta.clone() };
     let start = meta.clip[0];
     let mut file = Sections::new(meta, draft.poster, config.deflate_level)?;
     let pages: Vec<usize> = (0..n).filter(|&i| !draft.layers[i].params.is_empty()).collect();

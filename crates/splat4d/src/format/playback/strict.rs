@@ -81,6 +81,16 @@ fn of_meta(index: &Index, out: &mut Vec<String>) {
     if let Some(degree) = degrees.max().filter(|&d| d > meta.sh_degree) {
         out.push(format!("a palette has degree {degree}, `sh_degree` is {}", meta.sh_degree));
     }
+    for (k, rung) in meta.ladder.iter().enumerate() {
+        let most = index.bits_per_second(rung.tiers).into_iter().fold(0.0, f64::max);
+        if most > rung.rate * (1.0 + NEAR) {
+            out.push(format!(
+                "rung {} of the ladder needs {most:.0} bits per second, its `rate` is {}",
+                k + 1,
+                rung.rate
+            ));
+        }
+    }
     let damaged = meta.cameras.iter().filter(|c| c.camera().is_none());
     out.extend(damaged.map(|c| format!("camera `{}` has a pose or a lens that is not valid", c.name)));
     for (kind, name, empty) in

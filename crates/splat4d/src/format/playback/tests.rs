@@ -6,6 +6,7 @@ mod features;
 mod grow;
 mod hostile;
 mod labels;
+mod ladder;
 mod masks;
 mod sound;
 
@@ -343,6 +344,19 @@ fn more_gaussians_than_a_page_holds() {
     assert_eq!(counts, [(0, 10_000), (1, 40_000), (2, 40_000)]);
     assert_eq!(index.sections.iter().filter(|e| e.kind == Kind::Palette).count(), 0, "degree 0 needs no palette");
     assert_eq!(read(&bytes).unwrap().len(), 90_002);
+}
+
+#[test]
+fn a_large_scene_begins_with_a_coarse_image_below_1_mb() {
+    let mut draft = made_up(4, 0, 6);
+    let rng = Rng::new(6, "large", 0);
+    draft.nodes = vec![Node { primitives: (0..150_000).map(|i| primitive(rng.fork(i))).collect(), from: 0.0, to: 1.04 }];
+    let (bytes, _) = bytes_of(&draft, &WriteConfig { deflate_level: 1, ..WriteConfig::default() });
+    let index = Index::parse(&bytes, None).unwrap();
+    let counts: Vec<u32> = index.pages().map(|(_, e)| e.count).collect();
+    let first = index.pages().find(|(_, e)| e.tier == 0).map(|(_, e)| e.offset + u64::from(e.stored)).unwrap();
+    assert!(first < 1_000_000, "{first} bytes of {}", bytes.len());
+    assert!(counts.len() > 2 && counts[0] < counts[1] && counts.iter().sum::<u32>() == 150_000, "{counts:?}");
 }
 
 #[test]

@@ -4,10 +4,11 @@ use super::block::encode_page;
 use super::cluster::cluster;
 use super::deflate::deflate;
 use super::index::{MASK_HEAD, crc, mask_keys};
+use super::ladder::{Ladder, Next, Tier};
 use super::page::parse_page;
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
-    MAX_PALETTE, Meta, Node, Page, Palette, features, labels, mask, order,
+    MAX_PALETTE, Meta, Node, Page, Palette, Rung, features, labels, ladder, mask, order,
 };
 use crate::math::{Rng, quat, sh};
 use crate::scene::KeyMasks;
@@ -22,6 +23,9 @@ const SMALL_PALETTE: usize = 256;
 /// many show the bundled scene at 28 dB, its dynamic regions at 29 dB; a quarter shows it at 22 and 23 dB.
 const FIRST_TIER: f64 = 0.4;
 const SMALLEST_TIER: usize = 4096;
+/// Most Gaussians in the first tiers of one time, so that a coarse image needs less than 1 MB: a Gaussian has 18 to 24
+/// bytes, and index and poster take some of it.
+pub(super) const FIRST_GAUSSIANS: f64 = 32_000.0;
 /// The program that writes, as files name it.
 pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
@@ -46,11 +50,24 @@ pub struct WriteConfig {
     pub seed: u64,
     /// Bits of the codes.
     pub depths: Depths,
+    /// Rates of a bitrate ladder, bits per second, rising; empty: none.
+    pub ladder: Vec<f64>,
+    /// Bytes that are added to the file later and count in these rates: sound.
+    pub later: u64,
 }
 
 impl Default for WriteConfig {
     fn default() -> Self {
-        Self { palette: 8192, kmeans_rounds: 8, tier: 0, deflate_level: 6, seed: 0, depths: Depths::default() }
+        Self {
+            palette: 8192,
+            kmeans_rounds: 8,
+            tier: 0,
+            deflate_level: 6,
+            seed: 0,
+            depths: Depths::default(),
+            ladder: Vec::new(),
+            later: 0,
+        }
     }
 }
 
@@ -124,12 +141,8 @@ pub struct Summary {
     pub errors: Errors,
 }
 
-/// Some Gaussians of a node that become a page.
-struct Piece {
-    node: usize,
-    tier: u16,
-    rows: Vec<u32>,
-}
+/// What Gaussians of degree 1 and more refer to: the palette, and every Gaussian's entry by node.
+type Coded = (Option<Palette>, Vec<Vec<u16>>);
 
 /// A file in the making: sections one by one, and what they weigh.
 pub(super) struct Sections {
@@ -208,8 +221,8 @@ impl Sections {
         self.file.sections.iter().rposition(|e| e.kind == Kind::Page).expect("a page was added") as u32
     }
 
-    /// Writes the file. Errors: the sink's.
-    pub(super) fn finish(mut self, out: &mut dyn Write) -> Result<Summary> {
+    /// Adds what is behind everything that is rendered, and places all sections.
+    fn complete(&mut self) -> &Index {
         for (page, body) in std::mem::take(&mut self.labels) {
             self.add(Entry { count: body.len() as u32, page: Some(page), ..entry(Kind::Labels) }, body);
         }
@@ -222,6 +235,13 @@ impl Sections {
         if let Some(p) = self.late.take() {
             self.summary.poster_bytes = self.add(entry(Kind::Poster), p);
         }
+        self.file.bytes(GENERATOR);
+        &self.file
+    }
+
+    /// Writes the file. Errors: the sink's.
+    pub(super) fn finish(mut self, out: &mut dyn Write) -> Result<Summary> {
+        self.complete();
         let head = self.file.bytes(GENERATOR);
         self.summary.bytes = self.file.file_len;
         self.summary.errors.finish();
@@ -253,38 +273,76 @@ impl PageEntry {
 /// Errors: numbers that are not finite, spans, depths or metadata out of range, the sink's.
 /// Panics: a node has more than 4 billion Gaussians.
 pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
-    let mut meta = draft.meta.clone();
-    meta.gaussians = draft.nodes.iter().map(|n| n.primitives.len()).sum();
     config.depths.check()?;
-    let mut file = Sections::new(meta, draft.poster.as_deref(), config.deflate_level)?;
     draft
         .nodes
         .iter()
         .enumerate()
         .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
-    let (palette, entries) = palette(draft, config);
-    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what colours
-    // them, the rest of them; then time continues.
+    let coded = palette(draft, config);
+    let file = if config.ladder.is_empty() {
+        assemble(draft, config, &coded, tiers(draft, config), &[])?
+    } else {
+        climb(draft, config, &coded)?
+    };
+    file.finish(out)
+}
+
+/// A file with a ladder: its tiers are chosen again with the bytes that they took, until they are within the rates.
+fn climb(draft: &Draft, config: &WriteConfig, coded: &Coded) -> Result<Sections> {
+    let mut ladder = Ladder::new(draft, &config.ladder)?;
+    let (mut beside, mut best) = (0.0, None);
+    loop {
+        let (tiers, rungs) = ladder.tiers(beside, &|rows| first_tier(rows, config));
+        let mut file = assemble(draft, config, coded, tiers, &rungs)?;
+        let index = file.complete();
+        let next = ladder.examine(index, config.later, &rungs)?;
+        let pages: u64 = index.pages().map(|(_, e)| u64::from(e.stored)).sum();
+        beside = (index.file_len - pages + config.later) as f64;
+        if next != Next::Smaller {
+            file.file.meta.ladder = ladder::stated(&file.file, config.later, &rungs, config.ladder.len());
+            best = Some(file);
+        }
+        if let Some(file) = best.take_if(|_| next == Next::Done || ladder.is_tired()) {
+            return Ok(file);
+        }
+    }
+}
+
+/// A file of these tiers: first what the first image needs, the important Gaussians of the clip's start in their base
+/// colours, what colours them, the rest of them; then time continues. Each rung is behind the whole one before it.
+fn assemble(
+    draft: &Draft,
+    config: &WriteConfig,
+    (palette, entries): &Coded,
+    mut tiers: Vec<Tier>,
+    rungs: &[Rung],
+) -> Result<Sections> {
+    let mut meta = draft.meta.clone();
+    meta.gaussians = draft.nodes.iter().map(|n| n.primitives.len()).sum();
+    meta.ladder = rungs.to_vec();
+    let mut file = Sections::new(meta, draft.poster.as_deref(), config.deflate_level)?;
     let start = draft.meta.clip[0];
-    let mut pieces = pieces(draft, config);
-    let holds = |p: &Piece| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;
-    pieces.sort_by(|a, b| {
+    let holds = |p: &Tier| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;
+    let rung = |p: &Tier| rungs.iter().position(|r| p.tier < r.tiers);
+    tiers.sort_by(|a, b| {
         let (na, nb) = (&draft.nodes[a.node], &draft.nodes[b.node]);
         let (first_a, first_b) = (holds(a), holds(b));
         let by_time = na.from.total_cmp(&nb.from).then(nb.to.total_cmp(&na.to)).then(a.node.cmp(&b.node));
         let by_tier = a.tier.cmp(&b.tier);
         // At the start all nodes are needed at once, and a tier goes before a node; later the order is reversed.
-        first_b.cmp(&first_a).then(if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) })
+        let by_need = if first_a && first_b { by_tier.then(by_time) } else { by_time.then(by_tier) };
+        rung(a).cmp(&rung(b)).then(first_b.cmp(&first_a)).then(by_need)
     });
-    let before = pieces.iter().take_while(|p| p.tier == 0 && holds(p)).count();
+    let before = tiers.iter().take_while(|p| p.tier == 0 && holds(p)).count();
     let palette_at = (file.file.sections.len() + before) as u32;
-    for place in 0..=pieces.len() {
+    for place in 0..=tiers.len() {
         if place == before
-            && let Some(p) = &palette
+            && let Some(p) = palette
         {
             file.palette(p);
         }
-        let Some(piece) = pieces.get_mut(place) else { break };
+        let Some(piece) = tiers.get_mut(place) else { break };
         let node = &draft.nodes[piece.node];
         let span = [node.from, node.to];
         order::sort(&mut piece.rows, &node.primitives, span);
@@ -304,7 +362,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         }
         file.features(rows.iter().map(|(p, _)| p.features.as_slice()));
     }
-    file.finish(out)
+    Ok(file)
 }
 
 /// An entry of a kind, all else empty.
@@ -368,28 +426,46 @@ fn check(node: &Node, meta: &Meta) -> Result<()> {
     Ok(())
 }
 
+/// Gaussians of the first tier of so many.
+fn first_tier(rows: usize, config: &WriteConfig) -> usize {
+    let share = ((rows as f64 * FIRST_TIER) as usize).max(SMALLEST_TIER);
+    let first = if config.tier > 0 { config.tier } else { share }.min(MAX_PAGE_GAUSSIANS);
+    // A rest that is smaller than its tier does not justify another request.
+    if rows < 2 * first && rows <= MAX_PAGE_GAUSSIANS { rows } else { first.min(rows) }
+}
+
+/// What the first tiers are multiplied with, so that those of any one time are a coarse image of less than 1 MB.
+fn coarse_share(nodes: &[Node], first: impl Fn(usize) -> usize) -> f64 {
+    let edges = |(n, first): (&Node, f64)| [(n.from, first), (n.to, -first)];
+    let mut edges: Vec<(f64, f64)> =
+        nodes.iter().map(|n| (n, first(n.primitives.len()) as f64)).flat_map(edges).collect();
+    // Where one span ends and another begins, only one of them is rendered.
+    edges.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let sums = edges.iter().scan(0.0, |sum, (_, first)| {
+        *sum += first;
+        Some(*sum)
+    });
+    (FIRST_GAUSSIANS / sums.fold(1.0, f64::max)).min(1.0)
+}
+
 /// Divides nodes into pages: the first tier, then the rest, by importance.
-fn pieces(draft: &Draft, config: &WriteConfig) -> Vec<Piece> {
+fn tiers(draft: &Draft, config: &WriteConfig) -> Vec<Tier> {
     let mut out = Vec::new();
+    let coarse = if config.tier > 0 { 1.0 } else { coarse_share(&draft.nodes, |rows| first_tier(rows, config)) };
     for (node, n) in draft.nodes.iter().enumerate() {
         let mut rows: Vec<u32> = (0..n.primitives.len() as u32).collect();
         let importance = |i: u32| n.primitives[i as usize].importance;
         rows.sort_by(|&a, &b| importance(b).total_cmp(&importance(a)).then(a.cmp(&b)));
-        let share = ((rows.len() as f64 * FIRST_TIER) as usize).max(SMALLEST_TIER);
-        let first = if config.tier > 0 { config.tier } else { share }.min(MAX_PAGE_GAUSSIANS);
-        // A rest that is smaller than its tier does not justify another request.
-        let first = if rows.len() < 2 * first && rows.len() <= MAX_PAGE_GAUSSIANS { rows.len() } else { first };
-        let (head, rest) = rows.split_at(first);
-        let size = rest.len().div_ceil(rest.len().div_ceil(MAX_PAGE_GAUSSIANS).max(1)).max(1);
-        for (tier, rows) in std::iter::once(head).chain(rest.chunks(size)).filter(|r| !r.is_empty()).enumerate() {
-            out.push(Piece { node, tier: tier.min(usize::from(u16::MAX)) as u16, rows: rows.to_vec() });
+        let first = first_tier(rows.len(), config);
+        for (tier, rows) in ladder::pages(&rows, first, coarse).into_iter().enumerate() {
+            out.push(Tier { node, tier: tier.min(usize::from(u16::MAX)) as u16, rows: rows.to_vec() });
         }
     }
     out
 }
 
 /// The palette, and every Gaussian's entry by node. None, and no labels, for scenes of degree 0.
-fn palette(draft: &Draft, config: &WriteConfig) -> (Option<Palette>, Vec<Vec<u16>>) {
+fn palette(draft: &Draft, config: &WriteConfig) -> Coded {
     let degree = draft.meta.sh_degree;
     let width = 3 * (sh::coeffs(degree) - 1);
     let all = || draft.nodes.iter().flat_map(|n| &n.primitives);
@@ -402,7 +478,8 @@ fn palette(draft: &Draft, config: &WriteConfig) -> (Option<Palette>, Vec<Vec<u16
     let weight = |p| if mean > 0.0 { (importance(p) / mean) as f32 } else { 1.0 };
     let points = all().map(|p| (&p.sh_rest[..width], weight(p).clamp(WEIGHTS[0], WEIGHTS[1])));
     let worth = (n / GAUSSIANS_PER_ENTRY).max(SMALL_PALETTE);
-    let entries = config.palette.clamp(1, MAX_PALETTE).min(worth);
+    let affordable = ladder::palette_entries(draft, &config.ladder, width);
+    let entries = config.palette.clamp(1, MAX_PALETTE).min(worth).min(affordable);
     let clusters = cluster(points, width, entries, config.kmeans_rounds, Rng::new(config.seed, "palette", 0));
     let mut labels = clusters.labels.iter().map(|&l| l as u16);
     let by_node = draft.nodes.iter().map(|n| labels.by_ref().take(n.primitives.len()).collect()).collect();
