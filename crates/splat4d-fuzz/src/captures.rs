@@ -365,7 +365,6 @@ where
 {
     let mut out = Cursor::new(Vec::new());
     picture.write_to(&mut out, format).expect("memory takes all bytes");
-    drop(writer);
     out.into_inner()
 }
 

@@ -13,7 +13,7 @@ import { inflateRawSync } from 'node:zlib';
 import { launch, open } from './browser.mjs';
 import { psnr } from './reference.mjs';
 import { layout, sample } from './sample.mjs';
-import { serve } from './server.mjs';
+import { PLAYER, serve } from './server.mjs';
 
 const PROGRAM = process.env.SPLAT4D;
 const IWER = path.join(process.env.PLAYWRIGHT ?? '', 'node_modules/iwer/build/iwer.min.js');
@@ -66,8 +66,8 @@ function part(bytes, tiers) {
   return layout(json, out);
 }
 
-const element = (attributes) => `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}</style><splat-4d
-  src="/scene.s4d" backend="webgl2" resolution="1" ${attributes} style="display:block;width:${WIDTH}px;height:${HEIGHT}px;min-height:0">
+const element = (attributes, backend) => `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}</style><splat-4d
+  src="/scene.s4d" backend="${backend}" resolution="1" ${attributes} style="display:block;width:${WIDTH}px;height:${HEIGHT}px;min-height:0">
   </splat-4d><script type="module" src="/player/element.js"></script>`;
 const LOADED = () => document.querySelector('splat-4d').statistics?.firstFrame > 0;
 
@@ -86,8 +86,8 @@ const RECORD = () =>
     wait();
   });
 
-async function opened(t, attributes, { bytes = file().bytes, rate = 0, init = [] } = {}) {
-  const server = await serve({ files: { 'page.html': element(attributes), 'empty.html': '<!doctype html>', 'scene.s4d': bytes }, rate });
+async function opened(t, attributes, { bytes = file().bytes, rate = 0, init = [], backend = 'webgl2' } = {}) {
+  const server = await serve({ files: { 'page.html': element(attributes, backend), 'empty.html': '<!doctype html>', 'scene.s4d': bytes }, rate });
   const { page, errors } = await open(browser, `${server.url}empty.html`);
   t.after(() => Promise.all([page.close(), server.close()]));
   for (const script of [RECORD, ...init]) await page.addInitScript(script);
@@ -194,8 +194,8 @@ test('a pinned rung is the CPU render of its pages, and idle pages become whole'
   assert.deepEqual(errors, []);
 });
 
-test('a device that is too slow renders a lower rung, and the player reports it', options, async (t) => {
-  const { page, errors } = await opened(t, 'loop="false"');
+for (const backend of ['webgl2', 'webgpu']) test(`a device that is too slow renders a lower rung with ${backend}, and the player reports it`, options, async (t) => {
+  const { page, errors } = await opened(t, 'loop="false"', { backend });
   const seen = await page.evaluate(async () => {
     const e = document.querySelector('splat-4d');
     await e.settled();
@@ -213,6 +213,45 @@ test('a device that is too slow renders a lower rung, and the player reports it'
   assert.deepEqual([seen.after.limit, seen.after.reason], [seen.before.rungs - 1, 'device']);
   assert.ok(seen.after.rung === seen.before.rungs - 1 && seen.after.leftOut > 0 && seen.after.drawn < seen.before.drawn);
   assert.ok(seen.rungs.some((r) => r.reason === 'device') && /Slow device: bit rate 3 of 4/.test(seen.text), seen.text);
+  assert.deepEqual(errors, []);
+});
+
+test('the object of three.js renders the rung that is set', options, async (t) => {
+  const map = { imports: { 'splat4d/three': '/npm/three.js', three: '/three/three.module.js' } };
+  const html = `<!doctype html><link rel="icon" href="data:,"><script type="importmap">${JSON.stringify(map)}</script><canvas width="160" height="120">
+    </canvas><script type="module">import * as THREE from 'three'; import { Splat4D } from 'splat4d/three'; Object.assign(globalThis, { THREE, Splat4D });
+    globalThis.there = true;</script>`;
+  const npm = fileURLToPath(new URL('../../npm/', import.meta.url)),
+    three = path.join(process.env.PLAYWRIGHT ?? '', 'node_modules/three/build/');
+  const server = await serve({ files: { 'page.html': html, 'scene.s4d': file().bytes }, folders: { '/npm/player/': PLAYER, '/npm/': npm, '/three/': three } });
+  const { page, errors } = await open(browser, `${server.url}page.html`);
+  t.after(() => Promise.all([page.close(), server.close()]));
+  await page.waitForFunction(() => globalThis.there, null, { timeout: 30_000 });
+  const seen = await page.evaluate(async () => {
+    const { THREE, Splat4D } = globalThis,
+      renderer = new THREE.WebGLRenderer({ canvas: document.querySelector('canvas') }),
+      scene = new THREE.Scene(),
+      object = new Splat4D('/scene.s4d', { rung: 1 });
+    scene.add(object);
+    await object.ready;
+    const camera = new THREE.PerspectiveCamera(50, 4 / 3, 0.05, 100);
+    camera.position.set(0, 1, 6);
+    const rendered = async () => {
+      for (let i = 0; i < 2; i++) {
+        renderer.render(scene, camera);
+        await object.settled();
+      }
+      renderer.render(scene, camera);
+      return { drawn: object.drawn, rung: object.rung, ...object.ladder };
+    };
+    const low = await rendered();
+    object.rung = 'auto';
+    return [low, await rendered()];
+  });
+  const [low, whole] = seen;
+  t.diagnostic(`${low.drawn} Gaussians in rung 1, ${whole.drawn} in all`);
+  assert.deepEqual([low.rung, low.chosen, low.reason], [1, 1, 'pinned']);
+  assert.ok(low.leftOut > 0 && low.drawn > 0 && low.drawn < whole.drawn && whole.leftOut === 0, JSON.stringify(seen));
   assert.deepEqual(errors, []);
 });
 
