@@ -13,7 +13,7 @@ use crate::models::{Kind, Model};
 use serde_json::{Map as Object, Value, json};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, CaptureOptions, Frame, Rgb8};
-use splat4d_train::output::{OutputFolder, written};
+use splat4d_train::output::{OutputFolder, write_atomically, written};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -254,7 +254,7 @@ impl Work<'_> {
             let name = format!("{}/{}.{}", self.part.name(), file_name(&job.key), write::ending(self.model));
             if !self.folder.join(&name).is_file() {
                 match self.one(job)? {
-                    Encoded::File(bytes) => files::write(&self.folder.join(&name), &bytes)?,
+                    Encoded::File(bytes) => write_atomically(&self.folder.join(&name), &bytes)?,
                     Encoded::Broken(what) => {
                         broken.push(format!("{}: {what}", job.key));
                         continue;
