@@ -277,6 +277,8 @@ wrong-pose a0e1b117bce0f933
 enters 2d82685c499b5684
 hand-held-12 347924cf4e2fc032
 hand-held-60 36359dac295000bb
+walk-60 d04f76c1a4540cdd
+walk-300 32230e76cd1ad421
 ";
 
     #[test]

@@ -1,4 +1,4 @@
-//! Files of measured surfaces, told apart by their first bytes.
+//! Files of measured surfaces, distinguished by their first bytes.
 
 use super::surface::{Sink, Surface};
 use super::{e57, las, pcd};
