@@ -13,7 +13,7 @@ use crate::models::{Kind, Model};
 use serde_json::{Map as Object, Value, json};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, CaptureOptions, Frame, Rgb8};
-use splat4d_train::output::{OutputFolder, written};
+use splat4d_train::output::{OutputFolder, write_atomically, written};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -125,6 +125,8 @@ pub fn priors(request: &Priors, stop: &AtomicBool, console: &dyn Listener) -> Re
         .iter()
         .map(|(&part, path)| Ok((part, load(part, path, request.described.get(&part).map(String::as_str))?)))
         .collect::<Result<_>>()?;
+    let root = if request.capture.is_dir() { Some(request.capture.as_path()) } else { request.capture.parent() };
+    root.map_or(Ok(()), |root| mend(&root.join(FOLDER)))?;
     let capture = Capture::open(&request.capture, &CaptureOptions::default())?;
     capture.warnings.iter().for_each(|w| console.warn(w));
     models.values().filter_map(Model::warning).for_each(|w| console.warn(&w));
@@ -136,7 +138,9 @@ pub fn priors(request: &Priors, stop: &AtomicBool, console: &dyn Listener) -> Re
         let work = Work { part, model, capture: &capture, folder: &folder, stop, console };
         let files = work.all(request.force)?;
         console.clear();
-        add_to_list(&folder, part, &list_entry(model, files))?;
+        let mut parts = read_list(&folder)?;
+        parts.insert(part.name().into(), list_entry(model, files));
+        write_list(&folder, parts)?;
     }
     let capture = Capture::open(&request.capture, &CaptureOptions::default())?;
     for &part in models.keys() {
@@ -182,23 +186,45 @@ fn list_entry(model: &Model, files: BTreeMap<String, String>) -> Value {
     entry.into()
 }
 
-/// Adds a part to the list, whose other parts stay. Errors: a list of another version; the disk.
-fn add_to_list(folder: &Path, part: Part, entry: &Value) -> Result<()> {
+/// The list of a folder: its parts by name; empty where there is none. Errors: a damaged list, or one of another version.
+fn read_list(folder: &Path) -> Result<Object<String, Value>> {
     let path = folder.join(LIST);
-    let mut list = match path.is_file() {
-        true => serde_json::from_str(&files::read_text(&path)?).map_err(|e| {
-            Error::input(format!("is not valid JSON: {e}"))
-                .at(path.display())
-                .remedy("Remove it, and run the command again")
-        })?,
-        false => json!({"version": 1}),
-    };
-    let Some(parts) = list.as_object_mut().filter(|o| o.get("version") == Some(&json!(1))) else {
-        return Err(Error::input("expected a list of version 1").at(path.display()).remedy("Use a newer splat4d"));
-    };
+    if !path.is_file() {
+        return Ok(Object::new());
+    }
+    let list: Value = serde_json::from_str(&files::read_text(&path)?).map_err(|e| {
+        Error::input(format!("is not valid JSON: {e}"))
+            .at(path.display())
+            .remedy("Remove it, and run the command again")
+    })?;
+    match list {
+        Value::Object(parts) if parts.get("version") == Some(&json!(1)) => Ok(parts),
+        _ => Err(Error::input("expected a list of version 1").at(path.display()).remedy("Use a newer splat4d")),
+    }
+}
+
+/// Writes the list of a folder. Errors: the disk.
+fn write_list(folder: &Path, mut parts: Object<String, Value>) -> Result<()> {
+    parts.insert("version".into(), 1.into());
     parts.insert("writer".into(), format!("splat4d {}", env!("CARGO_PKG_VERSION")).into());
-    parts.insert(part.name().into(), entry.clone());
-    files::write(&path, serde_json::to_string_pretty(&list).expect("it is plain data").as_bytes())
+    let text = serde_json::to_string_pretty(&Value::Object(parts)).expect("it is plain data");
+    files::write(&folder.join(LIST), text.as_bytes())
+}
+
+/// Takes parts with files that are missing out of the list: such a capture cannot be opened, and they are computed again.
+fn mend(folder: &Path) -> Result<()> {
+    let mut parts = read_list(folder)?;
+    let whole = |part: &Value| {
+        let names = part["files"].as_object().into_iter().flatten();
+        names.filter_map(|(_, name)| name.as_str()).all(|name| folder.join(name).is_file())
+    };
+    let before = parts.len();
+    parts.retain(|_, part| whole(part));
+    if parts.len() == before || !written(folder).contains(Path::new(LIST)) {
+        return Ok(());
+    }
+    let _owned = OutputFolder::amend(folder, FOLDER)?;
+    write_list(folder, parts)
 }
 
 /// One network and its capture.
@@ -228,7 +254,7 @@ impl Work<'_> {
             let name = format!("{}/{}.{}", self.part.name(), file_name(&job.key), write::ending(self.model));
             if !self.folder.join(&name).is_file() {
                 match self.one(job)? {
-                    Encoded::File(bytes) => files::write(&self.folder.join(&name), &bytes)?,
+                    Encoded::File(bytes) => write_atomically(&self.folder.join(&name), &bytes)?,
                     Encoded::Broken(what) => {
                         broken.push(format!("{}: {what}", job.key));
                         continue;
@@ -263,8 +289,10 @@ impl Work<'_> {
                 .at(path.display())
                 .remedy("Move it out of the folder priors")
         };
-        if note.exists() && !listed.contains(Path::new(&format!("{part}.json"))) {
-            return Err(foreign(&note));
+        for name in [LIST, &format!("{part}.json")] {
+            if self.folder.join(name).exists() && !listed.contains(Path::new(name)) {
+                return Err(foreign(&self.folder.join(name)));
+            }
         }
         let before = note.is_file().then(|| files::read_text(&note)).transpose()?;
         let identity = |text: &String| serde_json::from_str::<Value>(text).ok().map(|v| v["identity"].clone());
@@ -279,7 +307,12 @@ impl Work<'_> {
         if let Some(file) = others(&self.folder.join(part), self.folder, &listed) {
             return Err(foreign(&file));
         }
-        if force || !same {
+        if (force || !same) && !own.is_empty() {
+            // First, so that the capture can be opened at any time.
+            let mut parts = read_list(self.folder)?;
+            if parts.remove(part).is_some() {
+                write_list(self.folder, parts)?;
+            }
             for file in own {
                 let path = self.folder.join(file);
                 std::fs::remove_file(&path).map_err(|e| files::cannot_write(&path, e))?;

@@ -29,6 +29,8 @@ const FALLING: f64 = 0.7;
 /// is this share of a standard deviation.
 const VISIBLE: f64 = 0.3;
 const OF_DEVIATION: f64 = 0.385;
+/// Deviations from which on a pair has no weight (Tukey's biweight).
+const TUKEY: f64 = 4.7;
 /// Rounds of reweighting.
 const ROUNDS: usize = 20;
 /// Least spread of errors that reweighting assumes.
@@ -210,15 +212,17 @@ impl Line {
     }
 }
 
-/// Least squares with Cauchy's weights from a line on. `usual`: the slope that other frames have.
+/// Least squares with Tukey's weights from a line on. `usual`: the slope that other frames have. The deviation only falls:
+/// else what is hidden gains weight round by round.
 fn refined(pairs: &[[f64; 2]], mut line: Line, usual: Option<f64>) -> Line {
-    let n = pairs.len() as f64;
+    let (n, mut deviation) = (pairs.len() as f64, f64::INFINITY);
     for _ in 0..ROUNDS {
-        let deviation = line.deviation(pairs).max(SHARPEST);
+        deviation = line.deviation(pairs).min(deviation).max(SHARPEST);
         let [mut xx, mut x1, mut one, mut xy, mut y1] = [0.0; 5];
         for p in pairs {
             let [x, y] = *p;
-            let weight = 1.0 / ((1.0 + (line.error(p) / (2.0 * deviation)).powi(2)) * y * y);
+            let off = line.error(p) / (TUKEY * deviation);
+            let weight = (1.0 - off * off).max(0.0).powi(2) / (y * y);
             xx += weight * x * x;
             x1 += weight * x;
             one += weight;

@@ -386,7 +386,8 @@ mod tests {
             let map = picture.depth.unwrap();
             assert_eq!(map.kind, DepthKind::Metric);
             let off = |x: usize| (f64::from(map.values.get(0, 16, x)) / depth(x) - 1.0).abs();
-            assert!((0..SIDE).all(|x| off(x) < 0.01), "{kind}: {:?}", (0..SIDE).map(off).collect::<Vec<_>>());
+            // Points are compared with the pixel that they are in.
+            assert!((0..SIDE).all(|x| off(x) < 0.02), "{kind}: {:?}", (0..SIDE).map(off).collect::<Vec<_>>());
             // Nothing is fitted twice, or to a unit of its own.
             assert_eq!(believed(fitted, &recipe).unwrap().1, None);
         }

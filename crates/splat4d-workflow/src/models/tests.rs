@@ -1,7 +1,7 @@
 pub(crate) mod onnx;
 
 use super::*;
-use onnx::{Attribute, Graph, IMAGES, channel, of_channel, of_means};
+use onnx::{Attribute, Graph, IMAGES, channel, of_channel, of_means, of_points};
 use splat4d_train::capture::Rgb8;
 
 /// A description of one image in any size.
@@ -225,20 +225,8 @@ fn stand_in(name: &str) -> Vec<u8> {
             graph.output("y", &[Some(1), Some(channels), Some(side), Some(side)]);
         }
         "superpoint-lightglue" => {
-            graph.input("images", &[None, Some(1), None, None]);
-            let points = graph.floats(&[2, 2, 2], &[0.0, 0.0, 511.5, 255.5, 1.0, 2.0, 3.0, 4.0]);
-            let pairs = graph.ints(&[3, 3], &[0, 0, 1, 0, 1, 0, 0, 1, 1]);
-            let scores = graph.floats(&[3], &[0.9, 0.5, 0.1]);
-            // All outputs depend on the images, by nothing.
-            let sum = graph.node("ReduceMax", &["images"], &[Attribute::Int("keepdims", 0)]);
-            let nothing = graph.floats(&[], &[0.0]);
-            let nothing = graph.node("Mul", &[&sum, &nothing], &[]);
-            graph.named("Add", &[&points, &nothing], "keypoints", &[]);
-            graph.named("Identity", &[&pairs], "matches", &[]);
-            graph.named("Add", &[&scores, &nothing], "mscores", &[]);
-            for (output, axes) in [("keypoints", 3), ("matches", 2), ("mscores", 1)] {
-                graph.output(output, &vec![None; axes]);
-            }
+            let points = [0.0, 0.0, 511.5, 255.5, 1.0, 2.0, 3.0, 4.0];
+            return of_points(&points, &[0, 0, 1, 0, 1, 0, 0, 1, 1], &[0.9, 0.5, 0.1]);
         }
         other => panic!("{other} has no stand-in"),
     }

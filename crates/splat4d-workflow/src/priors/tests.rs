@@ -1,6 +1,6 @@
 use super::*;
 use crate::events::{Event, ignore};
-use crate::models::tests::onnx::{IMAGES, of_channel, of_means};
+use crate::models::tests::onnx::{IMAGES, of_channel, of_means, of_points};
 use splat4d_train::capture::{DepthKind, ImageStore};
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -110,6 +110,20 @@ fn training_finds_what_networks_wrote() {
 }
 
 #[test]
+fn matches_become_tracks() {
+    let place = Place::new();
+    let network = of_points(&[4.0, 3.0, 20.0, 10.0, 4.0, 3.0, 20.0, 10.0], &[0, 0, 0, 0, 1, 1], &[0.9, 0.8]);
+    place.network("points", &network, "kind = \"matches\"");
+    let text = "version = 1\n[input]\nchannels = \"grey\"\npair = \"batch\"\n[output]\nkind = \"matches\"\n";
+    std::fs::write(place.0.path().join("points.toml"), text).unwrap();
+    let made = place.run(&[(Part::Tracks, "points")]).unwrap();
+    let table = std::fs::read_to_string(place.take().join("priors/tracks/c.csv")).unwrap();
+    assert!(table.lines().count() == 1 + 2 * FRAMES && table.contains("\n0,0,4.500,3.500\n"), "{table}");
+    assert!(place.opened().frames.iter().all(|f| f.tracks.is_some()));
+    assert_eq!((made.rows.len(), made.rows[0].images), (1, FRAMES));
+}
+
+#[test]
 fn the_same_request_continues_and_another_network_is_refused() {
     let place = Place::new();
     place.run(&[(Part::Depth, "depth")]).unwrap();
@@ -131,6 +145,11 @@ fn the_same_request_continues_and_another_network_is_refused() {
         "{:?}",
         made.rows
     );
+    // A lost file is made again, although the list names it.
+    std::fs::remove_file(file(3)).unwrap();
+    assert!(Capture::open(&place.take(), &CaptureOptions::default()).is_err());
+    place.run(&[(Part::Depth, "far")]).unwrap();
+    assert!(file(3).is_file());
     // Other parts of the list stay.
     place.run(&[(Part::Masks, "mask")]).unwrap();
     assert!(place.opened().frames.iter().all(|f| f.depth.is_some() && f.mask.is_some()));

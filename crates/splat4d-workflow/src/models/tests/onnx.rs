@@ -191,3 +191,23 @@ pub(crate) fn of_means(factor: f32) -> Vec<u8> {
     graph.output("flow", &[Some(1), Some(2), None, None]);
     graph.file()
 }
+
+/// A matcher that returns the same for all images: key points [2, n, 2] of both, matches [m, 3] and their scores.
+pub(crate) fn of_points(points: &[f32], pairs: &[i64], scores: &[f32]) -> Vec<u8> {
+    let mut graph = Graph::default();
+    graph.input("images", &[None, Some(1), None, None]);
+    let points = graph.floats(&[2, points.len() / 4, 2], points);
+    let pairs = graph.ints(&[scores.len(), 3], pairs);
+    let scores = graph.floats(&[scores.len()], scores);
+    // Its outputs depend on the images, by nothing.
+    let largest = graph.node("ReduceMax", &["images"], &[Attribute::Int("keepdims", 0)]);
+    let zero = graph.floats(&[], &[0.0]);
+    let zero = graph.node("Mul", &[&largest, &zero], &[]);
+    graph.named("Add", &[&points, &zero], "keypoints", &[]);
+    graph.named("Identity", &[&pairs], "matches", &[]);
+    graph.named("Add", &[&scores, &zero], "mscores", &[]);
+    for (output, axes) in [("keypoints", 3), ("matches", 2), ("mscores", 1)] {
+        graph.output(output, &vec![None; axes]);
+    }
+    graph.file()
+}
