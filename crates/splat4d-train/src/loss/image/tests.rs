@@ -120,10 +120,12 @@ fn channels_that_terms_need_are_rendered_once_in_a_fixed_order() {
 #[test]
 fn a_recipe_lists_the_terms_that_have_a_weight() {
     // Known depth costs nothing where there is none, and counts where there is.
-    let mut recipe = Recipe::default().with(|r| r.loss.depth = 0.0);
+    let mut recipe = Recipe::default().with(|r| (r.loss.depth, r.loss.geometry) = (0.0, 0.0));
     let count = |r: &Recipe| terms(&r.loss).len();
     assert_eq!(count(&recipe), 1, "colours alone");
-    for setting in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "flow", "tracks"] {
+    for setting in
+        ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "geometry", "flow", "tracks"]
+    {
         let before = count(&recipe);
         recipe.set(&format!("loss.{setting}=0.1")).unwrap();
         assert_eq!(count(&recipe), before + 1, "{setting}");

@@ -173,7 +173,7 @@ fn run(frames: Disturbed, line: &str) -> Left {
 /// Slow paths and no splits in time: in images of 24 pixels a model that follows motion as fast as the default's
 /// explains a
 /// wrong clock or pose by motion. In real images it finds both better than slow ones do (docs/refine.md).
-const SLOW: &str = "adc.split_in_time=0 adc.full_at=0 spacetime.velocity_lr_init=0.005 spacetime.velocity_lr_final=0.000016 \
+const SLOW: &str = "adc.split_in_time=0 adc.life_threshold=0 adc.full_at=0 spacetime.velocity_lr_init=0.005 spacetime.velocity_lr_final=0.000016 \
     life.width_lr=0.01 rates.opacity=0.05 rates.feature=0.006 rates.scaling=0.015";
 
 #[test]

@@ -122,7 +122,7 @@ fn clones_get_a_time_of_their_own() {
     let bed = Bed::new();
     for (retime, twins) in [(false, true), (true, false)] {
         let (mut seen, mut before) = (0, 80);
-        bed.watch(&format!("retime_clones={retime} percent_dense=1"), |trainer, change| {
+        bed.watch(&format!("retime_clones={retime} percent_dense=1 adc.life_threshold=0"), |trainer, change| {
             let p = &trainer.scene().layers[0].params;
             if change.added > 0 && change.removed == 0 && seen == 0 {
                 // Clones are behind the existing rows; no step has moved them yet.

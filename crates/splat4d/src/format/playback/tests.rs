@@ -350,7 +350,8 @@ fn more_gaussians_than_a_page_holds() {
 fn a_large_scene_begins_with_a_coarse_image_below_1_mb() {
     let mut draft = made_up(4, 0, 6);
     let rng = Rng::new(6, "large", 0);
-    draft.nodes = vec![Node { primitives: (0..150_000).map(|i| primitive(rng.fork(i))).collect(), from: 0.0, to: 1.04 }];
+    draft.nodes =
+        vec![Node { primitives: (0..150_000).map(|i| primitive(rng.fork(i))).collect(), from: 0.0, to: 1.04 }];
     let (bytes, _) = bytes_of(&draft, &WriteConfig { deflate_level: 1, ..WriteConfig::default() });
     let index = Index::parse(&bytes, None).unwrap();
     let counts: Vec<u32> = index.pages().map(|(_, e)| e.count).collect();
