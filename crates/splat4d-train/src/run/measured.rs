@@ -6,7 +6,7 @@ use super::open::OpenCapture;
 use super::priors::draw;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Event;
-use crate::loss::image::depth::{Apart, apart};
+use crate::loss::image::SEEN;
 use crate::recipe::Recipe;
 use crate::{Error, Result};
 use serde_json::json;
@@ -21,6 +21,8 @@ const LOOKED_AT: usize = 8;
 /// Images of a camera that are compared after training, evenly chosen, and of all cameras.
 const OF_CAMERA: usize = 4;
 const OF_ALL: usize = 64;
+/// Pixels of a camera that are compared, at least.
+const ENOUGH: usize = 20;
 /// A camera whose depth is off by more than this (median) contradicts the geometry.
 const OFF: f64 = 0.1;
 
@@ -133,20 +135,24 @@ fn rows(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -> Result<Vec
     let mut rows = Vec::new();
     for (camera, frames) in of_camera.iter().enumerate().filter(|(_, f)| !f.is_empty()) {
         let chosen: Vec<usize> = frames.iter().step_by(frames.len().div_ceil(most)).copied().collect();
-        let (mut shares, mut errors) = (0.0, Vec::new());
+        let (mut shares, mut ratios) = (0.0, Vec::new());
         for &i in &chosen {
             opened.frames.load(i, &mut picture)?;
             let Some(truth) = picture.measured() else { continue };
             let known = truth.values.data.iter().filter(|z| **z > 0.0).count();
             shares += known as f64 / truth.values.data.len().max(1) as f64;
             draw(scene, opened, i, &mut renderer, &mut image);
-            if let Some(Apart::Ratio(ratio, off)) = apart([&image.depth, &image.alpha], truth) {
-                errors.push([off, ratio]);
-            }
+            let pixels = image.depth.data.iter().zip(&image.alpha.data).zip(&truth.values.data);
+            let shown = pixels.filter(|((_, alpha), known)| f64::from(**alpha) >= SEEN && **known > 0.0);
+            ratios.extend(shown.map(|((depth, alpha), known)| depth / alpha / known));
         }
-        errors.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        let middle = errors.get(errors.len() / 2).copied();
-        rows.push(Row { camera, frames: chosen.len(), measured: shares / chosen.len() as f64, errors: middle });
+        let errors = (ratios.len() >= ENOUGH).then(|| {
+            let middle = ratios.len() / 2;
+            let ratio = f64::from(*ratios.select_nth_unstable_by(middle, f32::total_cmp).1);
+            ratios.iter_mut().for_each(|r| *r = (*r - 1.0).abs());
+            [f64::from(*ratios.select_nth_unstable_by(middle, f32::total_cmp).1), ratio]
+        });
+        rows.push(Row { camera, frames: chosen.len(), measured: shares / chosen.len() as f64, errors });
     }
     Ok(rows)
 }

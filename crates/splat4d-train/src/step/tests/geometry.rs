@@ -76,7 +76,7 @@ fn a_scan_of_every_frame_is_met_and_one_elsewhere_is_reported() {
     }
     std::fs::write(&ball, cloud.to_ply("comment a ball")).unwrap();
     let sets = ["loss.geometry=0.001"];
-    let (found, told, _) = trained("wrong", [0.6, 0.0, 0.6], &sets, Source::File(ball.clone()));
+    let (found, told, _) = trained("wrong", [0.5, 0.0, 0.5], &sets, Source::File(ball.clone()));
     assert!(found.is_some_and(|f| f.2.is_some_and(|e| e > 0.1)), "{found:?}");
     assert!(told.len() == 1 && told[0].contains("disagree") && told[0].contains("transform"), "{told:?}");
     let (found, _, file) = trained("off", [0.0; 3], &["loss.geometry=0"], Source::File(ball));
