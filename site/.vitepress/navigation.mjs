@@ -32,6 +32,7 @@ const GUIDES = [
   ['docs/refine', 'Refine cameras, localise images'],
   ['docs/shutters', 'Rolling shutter, blur, exposure'],
   ['docs/priors', 'Add depth, flow, tracks'],
+  ['docs/networks', 'Compute depth, flow, masks'],
   ['docs/evaluate', 'Measure and compare runs'],
   ['docs/render', 'Render images and films'],
   ['docs/file-size', 'Limit the file size'],

@@ -272,6 +272,19 @@ impl Console {
                 self.clear();
                 self.print_line(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
             }
+            Event::Geometry { measured, error, worst, worst_error } => {
+                self.clear();
+                let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+                let by = match (error, worst, worst_error) {
+                    (Some(error), Some(worst), Some(most)) => format!(
+                        "; median error of depth {}, the largest for camera {worst} ({})",
+                        percent(*error),
+                        percent(*most)
+                    ),
+                    _ => "; too few to compare".into(),
+                };
+                self.print_line(&format!("measured geometry: in {} of the pixels{by}", percent(*measured)));
+            }
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }

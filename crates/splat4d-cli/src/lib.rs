@@ -45,6 +45,7 @@ const BAD_INPUT: u8 = 2;
 const EXAMPLES: &str = "\
 Examples:
   splat4d import videos/ -o my-take        videos of one scene become a capture
+  splat4d priors my-take --depth d.onnx    depth maps by a network that you bring
   splat4d train examples/knight            train, measure, report and film the bundled capture
   splat4d train my-take --minutes 10       finish within ten minutes
   splat4d train --resume runs/my-take      continue a run exactly
@@ -108,6 +109,7 @@ enum Verb {
     Import(verbs::import::Args),
     #[cfg(not(feature = "import"))]
     Import(verbs::left_out::Args),
+    Priors(verbs::priors::Args),
     Train(Box<verbs::train::Args>),
     Join(verbs::join::Args),
     Status(verbs::status::Args),
@@ -138,6 +140,7 @@ impl Verb {
             Verb::Import(args) => verbs::import::run(args, console),
             #[cfg(not(feature = "import"))]
             Verb::Import(_) => Err(left_out("`import`", "import").into()),
+            Verb::Priors(args) => verbs::priors::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Join(args) => verbs::join::run(args, console),
             Verb::Status(args) => verbs::status::run(args, console),

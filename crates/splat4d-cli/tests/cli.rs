@@ -20,6 +20,8 @@ mod import;
 mod meshes;
 #[path = "cli/predict.rs"]
 mod predict;
+#[path = "cli/priors.rs"]
+mod priors;
 #[path = "cli/sample.rs"]
 mod sample;
 #[path = "cli/sound.rs"]
@@ -64,6 +66,7 @@ fn help_has_examples_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
     for verb in [
         "import",
+        "priors",
         "train",
         "join",
         "eval",

@@ -19,7 +19,7 @@ const PAGES: [Page; 4] = [
                | this page | import, info, train, join, status |\n\
                | [results](cli-results.md) | eval, compare, render, predict, localise |\n\
                | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
-               | [conversion and edits](cli-edits.md) | convert, edit, label, recipe, completions |\n\n\
+               | [conversion and edits](cli-edits.md) | convert, edit, label, priors, recipe, completions |\n\n\
                Every command also accepts these options:\n",
         commands: &["import", "info", "train", "join", "status"],
     },
@@ -37,9 +37,9 @@ const PAGES: [Page; 4] = [
     },
     Page {
         file: "cli-edits.md",
-        head: "# Command line: conversion and edits\n\nOptions of `convert`, `edit`, `label`, `recipe` and `completions`. \
-               Options that every command accepts: [captures and training](cli.md).\n",
-        commands: &["convert", "edit", "label", "recipe", "completions"],
+        head: "# Command line: conversion and edits\n\nOptions of `convert`, `edit`, `label`, `priors`, `recipe` and \
+               `completions`. Options that every command accepts: [captures and training](cli.md).\n",
+        commands: &["convert", "edit", "label", "priors", "recipe", "completions"],
     },
 ];
 

@@ -15,6 +15,7 @@ use tempfile::TempDir;
 
 pub(crate) const READERS: &[Reader] = &[
     Reader { name: "capture_json", seeds: || vec![own().into()], read: |b| open("own", "capture.json", b) },
+    Reader { name: "priors_json", seeds: || vec![PRIORS.into()], read: |b| open("priors", "priors/priors.json", b) },
     Reader {
         name: "transforms_json",
         seeds: || vec![transforms().into()],
@@ -73,9 +74,17 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "depth_npy", seeds: || vec![floats(&[6, 8])], read: |b| open("npy", "depth.npy", b) },
     Reader { name: "depth_exr", seeds: || vec![exr()], read: |b| open("exr", "depth.exr", b) },
     Reader { name: "depth_png", seeds: || vec![depth_png()], read: |b| open("png", "depth.png", b) },
+    Reader { name: "scan_las", seeds: || vec![las()], read: |b| open("scan_las", "scan.las", b) },
+    Reader { name: "scan_pcd", seeds: pcds, read: |b| open("scan_pcd", "scan.pcd", b) },
+    Reader { name: "scan_e57", seeds: || vec![e57_scan()], read: |b| open("scan_e57", "scan.e57", b) },
+    Reader { name: "scan_obj", seeds: || vec![OBJ.into()], read: |b| open("scan_obj", "scan.obj", b) },
+    Reader { name: "scan_ply", seeds: || vec![MESH.into()], read: |b| open("scan_ply", "scan.ply", b) },
     Reader { name: "picture", seeds: pictures, read: |b| drop(Rgb8::decode(b, Path::new("picture"))) },
 ];
 
+/// The list of what networks wrote.
+const PRIORS: &str = r#"{"version": 1, "writer": "splat4d", "depth": {"kind": "inverse", "scale": 1.0, "files": {"images/0.png": "depth/0.npy"}},
+"masks": {"files": {"images/0.png": "masks/0.png"}}, "tracks": {"files": {"a": "tracks.csv"}}}"#;
 const WIDTH: u32 = 8;
 const HEIGHT: u32 = 6;
 
@@ -136,6 +145,12 @@ fn made(layout: &str) -> TempDir {
     files.iter().for_each(|name| put(name, &png()));
     match layout {
         "own" => put("capture.json", own().as_bytes()),
+        "priors" => {
+            put("capture.json", own().as_bytes());
+            put("priors/depth/0.npy", &floats(&[6, 8]));
+            put("priors/masks/0.png", &grey(255));
+            put("priors/tracks.csv", TRACKS.as_bytes());
+        }
         "nerf" => put("transforms.json", transforms().as_bytes()),
         "panoptic" => put("train_meta.json", panoptic().as_bytes()),
         "n3dv" => put("poses_bounds.npy", &poses_bounds()),
@@ -172,6 +187,20 @@ fn made(layout: &str) -> TempDir {
             put("tracks.npz", &tracks_npz()[0]);
             put("capture.json", own().replacen("\"name\"", "\"tracks\":\"tracks.npz\",\"name\"", 1).as_bytes());
         }
+        scan if scan.starts_with("scan_") => {
+            let file = scan.replace('_', ".");
+            let bytes: Vec<u8> = match scan {
+                "scan_las" => las(),
+                "scan_pcd" => pcds().remove(0),
+                "scan_e57" => e57_scan(),
+                "scan_obj" => OBJ.into(),
+                _ => MESH.into(),
+            };
+            put(&file, &bytes);
+            // A second camera is held out, so that the first one's image is loaded with its depth.
+            let geometry = format!("\"geometry\":\"{file}\",\"hold_out\":\"none\",\"version\"");
+            put("capture.json", own().replacen("\"version\"", &geometry, 1).as_bytes());
+        }
         flow if flow.starts_with("flow_") => {
             let file = flow.replace('_', ".");
             let key = format!("\"flow\":[\"{file}\"],\"name\"");
@@ -192,6 +221,75 @@ fn made(layout: &str) -> TempDir {
         }
     }
     folder
+}
+
+/// A square one unit in front of the world's origin, as triangles.
+const OBJ: &str = "v -1 -1 0 1 0 0\nv 1 -1 0 0 1 0\nv 1 1 0 0 0 1\nv -1 1 0 1 1 1\nf 1 2 3\nf 1/1 3/2/1 -1\n";
+const MESH: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
+                    element face 1\nproperty list uchar int vertex_indices\nend_header\n-1 -1 0\n1 -1 0\n1 1 0\n-1 1 0\n\
+                    4 0 1 2 3\n";
+
+/// Points of such a square.
+fn square() -> impl Iterator<Item = [f32; 3]> {
+    (0..36).map(|i| [(i % 6) as f32 * 0.4 - 1.0, (i / 6) as f32 * 0.4 - 1.0, 0.0])
+}
+
+/// A LAS file of version 1.2 in format 0.
+fn las() -> Vec<u8> {
+    const HEADER: usize = 227;
+    let mut out = vec![0u8; HEADER];
+    out[..4].copy_from_slice(b"LASF");
+    (out[24], out[25]) = (1, 2);
+    out[96..100].copy_from_slice(&(HEADER as u32).to_le_bytes());
+    out[105] = 20;
+    out[107] = 36;
+    (0..3).for_each(|k| out[131 + 8 * k..139 + 8 * k].copy_from_slice(&0.01f64.to_le_bytes()));
+    for p in square() {
+        p.iter().for_each(|v| out.extend(((v * 100.0) as i32).to_le_bytes()));
+        out.extend([0; 8]);
+    }
+    out
+}
+
+/// A PCD file of every encoding.
+fn pcds() -> Vec<Vec<u8>> {
+    let header = |data: &str| {
+        format!(
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 36\nHEIGHT 1\nPOINTS \
+             36\nDATA {data}\n"
+        )
+    };
+    let rows: Vec<u8> = square()
+        .flat_map(|p| [p[0].to_bits(), p[1].to_bits(), p[2].to_bits(), 0xff_8040])
+        .flat_map(u32::to_le_bytes)
+        .collect();
+    let text: String = square().map(|p| format!("{} {} {} 16744512\n", p[0], p[1], p[2])).collect();
+    let columns: Vec<u8> =
+        (0..4).flat_map(|k| rows.chunks(16).flat_map(move |r| r[4 * k..4 * k + 4].to_vec())).collect();
+    let mut packed: Vec<u8> = Vec::new();
+    columns.chunks(32).for_each(|c| {
+        packed.push(c.len() as u8 - 1);
+        packed.extend(c);
+    });
+    let sizes = [packed.len(), columns.len()].map(|n| (n as u32).to_le_bytes()).concat();
+    vec![
+        [header("ascii").as_bytes(), text.as_bytes()].concat(),
+        [header("binary").as_bytes(), &rows].concat(),
+        [header("binary_compressed").as_bytes(), &sizes, &packed].concat(),
+    ]
+}
+
+fn e57_scan() -> Vec<u8> {
+    use e57::{E57Writer, Record, RecordValue};
+    let mut out = Cursor::new(Vec::new());
+    let mut writer = E57Writer::new(&mut out, "file").expect("memory takes a file");
+    let prototype = vec![Record::CARTESIAN_X_F32, Record::CARTESIAN_Y_F32, Record::CARTESIAN_Z_F32];
+    let mut scan = writer.add_pointcloud("scan", prototype).expect("it is a scan");
+    square().for_each(|p| scan.add_point(p.map(RecordValue::Single).to_vec()).expect("memory takes a point"));
+    scan.finalize().expect("the scan is whole");
+    writer.finalize().expect("the file is whole");
+    drop(writer);
+    out.into_inner()
 }
 
 const POSE: [[f64; 4]; 4] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]];

@@ -20,6 +20,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
     Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
     Reader { name: "compress_json", seeds: || vec![COMPRESS.into()], read: |b| open("compress.json", b) },
+    Reader { name: "geometry_json", seeds: || vec![GEOMETRY.into()], read: |b| open("geometry.json", b) },
     Reader { name: "refined_json", seeds: || vec![REFINED.into()], read: |b| open("refined.json", b) },
     Reader { name: "owner_json", seeds: || vec![OWNER.into()], read: |b| open(".splat4d/owner.json", b) },
     Reader { name: "output_files", seeds: || vec![FILES.into()], read: |b| open(".splat4d/files", b) },
@@ -39,6 +40,7 @@ const FILES: &str = "run.json\ntest/ours_10/\ntest/ours_10/renders/00000.png\nü
 const COMPRESS: &str = r#"{"bytes": 1000, "before": {"PSNR": 20.5}, "after": {"PSNR": 20.0}, "tiers": []}"#;
 const REFINED: &str =
     r#"{"cameras": [{"camera": "a", "frame": null, "twist": [0, 0, 0, 0, 0, 0.1], "offset": 0.01, "focal": 0.02}]}"#;
+const GEOMETRY: &str = r#"{"measured": 0.5, "error": 0.01, "worst": "a", "worst_error": 0.02, "cameras": [{"camera": "a", "frames": 4, "measured": 0.5, "error": null, "ratio": 1.0}]}"#;
 const OWNER: &str = r#"{"command": "train", "process": 7, "host": "h", "since": "2026-11-27T00:00:00Z", "machine": "m", "beat": "0000000001"}"#;
 
 fn run_json() -> String {

@@ -29,6 +29,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "clicks", seeds: || seeds(&[CLICKS]), read: clicks },
     Reader { name: "compress_toml", seeds: || seeds(&[ORDER]), read: |b| drop(texts::compress_order(&text(b))) },
     Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
+    Reader { name: "model_toml", seeds: models, read: |b| drop(texts::model(&text(b))) },
     Reader { name: "edit_request", seeds: requests, read: edit_request },
     Reader { name: "video_avi", seeds: films, read: film },
 ];
@@ -46,6 +47,10 @@ fn recipes() -> Vec<Vec<u8>> {
         "iterations = 300\nstrategy = \"mcmc\"\n[loss]\nmoving = 2.0\n",
         "[run]\nmotion = \"control\"\niterations = 7\n",
     ])
+}
+
+fn models() -> Vec<Vec<u8>> {
+    splat4d_workflow::models::PUBLISHED.iter().map(|(_, text)| text.as_bytes().to_vec()).collect()
 }
 
 fn settings() -> Vec<Vec<u8>> {

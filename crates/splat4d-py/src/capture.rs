@@ -4,13 +4,17 @@ use crate::arrays::{picture, plane, rows, shaped};
 use crate::camera::Camera;
 use crate::errors::{OrRaise, bad_input, warn};
 use crate::from_arrays::{Arrays, write};
+use crate::plain::plain;
 use crate::settings::set;
+use crate::workflows;
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use splat4d_train::capture::{self, CaptureSettings, ImageStore, Split};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
+use splat4d_workflow::priors::{self, Part, Priors};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -113,6 +117,28 @@ impl Capture {
         let arrays = Arrays { images, cameras, times, points, colors, names, fps, up, hold_out };
         write(py, &arrays, &folder)?;
         Self::open(py, folder, &Recipe::default(), temporary)
+    }
+
+    /// Runs networks, `{"depth": "d.onnx"}` (docs/networks.md), and returns figures. A capture that is opened later has the results.
+    #[pyo3(signature = (networks, described=BTreeMap::new(), force=false))]
+    fn priors(
+        &self,
+        py: Python<'_>,
+        networks: BTreeMap<String, PathBuf>,
+        described: BTreeMap<String, String>,
+        force: bool,
+    ) -> PyResult<Py<PyAny>> {
+        let part = |word: &str| {
+            let found = Part::ALL.into_iter().find(|part| part.name() == word);
+            found.ok_or_else(|| {
+                bad_input(format!("\"{word:.40}\" names no use of a network"), "Write depth, flow, masks or tracks")
+            })
+        };
+        let networks = networks.into_iter().map(|(word, path)| Ok((part(&word)?, path))).collect::<PyResult<_>>()?;
+        let described = described.into_iter().map(|(word, name)| Ok((part(&word)?, name))).collect::<PyResult<_>>()?;
+        let request = Priors { capture: self.path.clone(), networks, described, force };
+        let (made, _) = workflows::run(py, |listener, stop| priors::priors(&request, stop, listener))?;
+        plain(py, &made.json())
     }
 
     /// Name of the capture.

@@ -142,6 +142,17 @@ pub enum Event {
         /// Mean PSNR of some held-out views, dB; none: no view is held out.
         held_out: Option<f64>,
     },
+    /// How far the trained scene is from the capture's measured geometry. `geometry.json` of the run has it by camera.
+    Geometry {
+        /// Share of the pixels of training images with a measurement.
+        measured: f64,
+        /// Median relative error of depth, |D / D* − 1|: the median of the cameras'; none: too few pixels.
+        error: Option<f64>,
+        /// The camera with the largest error.
+        worst: Option<String>,
+        /// Its error.
+        worst_error: Option<f64>,
+    },
     /// Training is over.
     Finished {
         /// Steps taken.

@@ -33,7 +33,7 @@
 //! | `encode.rs` | images as PNG and JPEG files, and in another size |
 //! | `keypoints/` | SIFT keypoints and the image filters that they need |
 //! | `capture/` | layouts read into one `Capture`, chosen by `layout.rs`; file lookup (`lookup.rs`), masks, findings (`account.rs`), pose conventions (`convention.rs`), depth, flow and tracks, photos or videos without times (`sequence.rs`), a model next to other poses (`beside.rs`), the image store with a byte budget, captures far from the origin (`offset.rs`), panoramas |
-//! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/`, `capture/lookup/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right; images of one name with two endings |
+//! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/`, `capture/lookup/`, `capture/geometry/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right; images of one name with two endings; scans and meshes (.las, .pcd, .e57, .obj, .ply) and their depth from cameras |
 //! | `vision/` | computer vision on posed images: temporal medians (`view.rs`), matching along epipolar lines, triangulation, plane sweep, scale, dense flow |
 //! | `sampler.rs` | frames of a step, a pure function of seed, stage and step |
 //! | `optim/` | Adam, sparse over the active set, sixteen rows at a time; position noise of MCMC |
@@ -47,7 +47,7 @@
 //! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, rolling shutter and motion blur (`shutter.rs`), pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
 //! | `recipe.rs`, `recipe/` | all settings of a run, and the programs and plans built from them (`parts.rs`); TOML, `--set`, old names without tables |
 //! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
-//! | `run/` | the run on disk: open, start and resume, from checkpoint to checkpoint, rollback, points and flow found in images, checks of priors, memory estimate, `--minutes`, identity, metrics |
+//! | `run/` | the run on disk: open, start and resume, from checkpoint to checkpoint, rollback, points and flow found in images, checks of priors and of measured geometry, memory estimate, `--minutes`, identity, metrics |
 //! | `run/chunks/` | long captures in chunks: budget, plan, shared layer, training of a chunk, ties to neighbours, join |
 //! | `blended.rs`, `labels.rs`, `features.rs` | values of Gaussians as images blend them; labels from masks by expectation-maximisation; feature channels by conjugate gradients |
 //! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of tracks and flow, alignment of held-out cameras, trajectory errors, localisation, floaters, `results.json` and `per_view.json` |

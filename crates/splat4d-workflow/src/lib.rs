@@ -21,7 +21,7 @@
 //!
 //! `gpu` adds the GPU renderer. `dynamics` (forecasts), `import` (captures from videos, the doctor) and `serve` (the
 //! player's server) are on by default; without one its functions are missing, or return an error that names it.
-//! `storage` adds runs and captures on object storage.
+//! `storage` adds runs and captures on object storage, `models` the runtime of networks.
 //!
 //! # Code map
 //!
@@ -55,6 +55,7 @@
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
+//! | `models/`, `priors.rs`, `priors/` | networks that users bring; depth, flow, masks and tracks from them |
 //! | `recipe_schema.rs` | a JSON Schema of recipes, for editors |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
@@ -92,6 +93,7 @@ pub mod labelling;
 pub mod localising;
 pub mod measure;
 pub mod meshing;
+pub mod models;
 pub mod parts;
 pub mod paths;
 mod picking;
@@ -99,6 +101,7 @@ pub mod playable;
 pub mod point_queries;
 #[cfg(feature = "dynamics")]
 pub mod predicting;
+pub mod priors;
 pub mod programs;
 pub mod raw_values;
 pub mod recipe_schema;

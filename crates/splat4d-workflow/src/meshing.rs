@@ -191,7 +191,8 @@ impl<'a> Mesher<'a> {
 /// Whether a run was trained with depth maps: its splats are where the mean depth of their centres is right.
 fn trained_with_depth(run: &Run) -> bool {
     run.open_capture().is_ok_and(|(capture, recipe)| {
-        recipe.loss.depth > 0.0 && capture.train.iter().any(|&i| capture.frames[i].depth.is_some())
+        capture.geometry.is_some()
+            || recipe.loss.depth > 0.0 && capture.train.iter().any(|&i| capture.frames[i].depth.is_some())
     })
 }
 

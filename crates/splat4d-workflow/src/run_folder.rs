@@ -86,6 +86,8 @@ pub struct Run {
     pub views: Vec<ViewScore>,
     /// `compress.json`, where the run was made by compressing another.
     pub compressed: Value,
+    /// `geometry.json`, where the capture has measured geometry.
+    pub geometry: Value,
     /// The request of a run without checkpoints.
     asked: Option<RunRequest>,
     iteration: Option<usize>,
@@ -143,6 +145,7 @@ impl Run {
             run.results = Some(entry.clone());
         }
         run.compressed = parse(COMPRESS)?;
+        run.geometry = parse("geometry.json")?;
         run.views = newest(&parse("per_view.json")?).map(|(_, entry)| view_scores(entry)).unwrap_or_default();
         Ok(run)
     }

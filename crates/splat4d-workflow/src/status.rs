@@ -148,7 +148,8 @@ fn of_part(chunked: &Chunked, part: Part) -> PartStatus {
         Part::Shared => None,
         Part::Chunk(c) => Some(chunked.plan().frames(c)).map(|f| [f.start, f.end]),
     };
-    let waits_for: Vec<String> = chunked.waits_for(part).iter().map(ToString::to_string).collect();
+    let waits_for: Vec<String> =
+        chunked.needs(part).iter().filter(|p| !chunked.is_done(**p)).map(ToString::to_string).collect();
     let read = PartStatus { part: part.to_string(), frames, waits_for, ..begun(&folder) };
     let state = match read.state {
         _ if chunked.is_done(part) => State::Done,

@@ -31,6 +31,11 @@ pub fn compress_order(text: &str) -> Result<()> {
     CompressJob::read(text).map(drop)
 }
 
+/// Reads a description of a network, as `priors` does.
+pub fn model(text: &str) -> Result<()> {
+    crate::models::Description::parse(text).map(drop)
+}
+
 /// The server side of `view --edit`.
 pub struct Page(Editor);
 

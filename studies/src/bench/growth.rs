@@ -196,6 +196,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         timing: Timing::Told,
         fps: pinned.scene.fps,
         points: None,
+        geometry: None,
         background: None,
         up: pinned.scene.up,
         offset: [0.0; 3],

@@ -27,8 +27,6 @@ const FLOW_CODES: f64 = 64.0;
 const FLOW_ZERO: f64 = 32768.0;
 /// Seed of the points.
 const SEED: u64 = 18;
-/// Points of a cloud.
-const POINTS: usize = 500;
 /// Cosine of the least angle between two rays to a point: COLMAP keeps no point below 1.5°.
 const PARALLAX: f64 = 0.999_657;
 /// A point counts as seen if the depth at its pixel is smaller by at most this share.
@@ -138,11 +136,14 @@ fn description(name: &str, scene: &Scene) -> Value {
     };
     let held: Vec<String> =
         scene.viewers.iter().enumerate().filter(|(_, v)| v.held).map(|(c, _)| format!("cam{c:02}")).collect();
-    json!({
+    let mut capture = json!({
         "version": 1, "name": name, "fps": scene.fps, "up": [0, 1, 0], "points": "points.ply",
-        "hold_out": {"cameras": held},
         "cameras": scene.viewers.iter().enumerate().map(camera).collect::<Vec<_>>(),
-    })
+    });
+    if !held.is_empty() {
+        capture["hold_out"] = json!({ "cameras": held });
+    }
+    capture
 }
 
 /// A coloured point, in the world's units.
@@ -154,9 +155,9 @@ fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =
         training.flat_map(|v| v.poses.iter().enumerate().map(|(m, pose)| (pose, m))).collect();
-    let mut points = Vec::with_capacity(POINTS);
+    let mut points = Vec::with_capacity(scene.points);
     for draw in 0.. {
-        if points.len() == POINTS {
+        if points.len() == scene.points {
             break;
         }
         let rng = Rng::new(SEED, "points", draw);
@@ -276,6 +277,8 @@ wrong-pose a0e1b117bce0f933
 enters 2d82685c499b5684
 hand-held-12 347924cf4e2fc032
 hand-held-60 36359dac295000bb
+walk-60 d04f76c1a4540cdd
+walk-300 32230e76cd1ad421
 ";
 
     #[test]
@@ -350,6 +353,6 @@ hand-held-60 36359dac295000bb
         };
         let (tiny, huge) = (places("tiny-units", 1e-3), places("huge-units", 1e3));
         assert!((0..3).all(|k| (tiny[k] - huge[k]).abs() < 1e-9));
-        assert!(cloud(&of("hand-held-12")).len() == POINTS);
+        assert!(cloud(&of("hand-held-12")).len() == 500);
     }
 }

@@ -29,6 +29,14 @@ const WRONG_CAMERA: usize = 4;
 /// Poses of the two hand-held takes.
 const SHORT_PATH: usize = 12;
 const LONG_PATH: usize = 60;
+/// Poses of the two walks, and points of each pose's image in their clouds.
+const SHORT_WALK: usize = 60;
+const LONG_WALK: usize = 300;
+const WALK_POINTS: usize = 20;
+/// Distance of a walk, scene units.
+const WALKED: f64 = 24.0;
+/// Points of the other clouds.
+const POINTS: usize = 500;
 
 /// A camera of a synthetic capture.
 #[derive(Clone, Debug)]
@@ -61,14 +69,15 @@ pub(crate) struct Scene {
     pub fps: f64,
     /// Units of the files in units of the world.
     pub units: f64,
-    /// Whether points of moving objects belong to the cloud.
+    /// Points of the cloud, and whether those of moving objects belong to it.
+    pub points: usize,
     pub moving_points: bool,
     /// Whether depth and flow of the images to train on are written next to them.
     pub truth: bool,
 }
 
 /// Names of the synthetic captures, each with what is hard about it.
-pub(crate) const NAMES: [(&str, &str); 11] = [
+pub(crate) const NAMES: [(&str, &str); 13] = [
     ("far-background", "an object before a background at a hundred times the cameras' distance"),
     ("one-wall", "one moment of one textured wall, seen from the front, and little else"),
     ("tiny-units", "a room in units of a thousandth"),
@@ -80,6 +89,8 @@ pub(crate) const NAMES: [(&str, &str); 11] = [
     ("enters", "something comes into view at half time"),
     ("hand-held-12", "twelve moments from the path of one camera before a wall; a fixed camera is held out"),
     ("hand-held-60", "the same with sixty moments"),
+    ("walk-60", "one camera walks past near posts, stairs and houses; nothing moves, and the horizon is far"),
+    ("walk-300", "the same with five times the images"),
 ];
 
 /// A synthetic capture by its name.
@@ -90,6 +101,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
         moments: MOMENTS,
         fps: 10.0,
         units: 1.0,
+        points: POINTS,
         moving_points: true,
         truth: false,
     };
@@ -122,6 +134,8 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
         }
         "hand-held-12" => hand_held(SHORT_PATH),
         "hand-held-60" => hand_held(LONG_PATH),
+        "walk-60" => walk(SHORT_WALK),
+        "walk-300" => walk(LONG_WALK),
         _ => return None,
     };
     Some(scene)
@@ -232,7 +246,7 @@ fn hand_held(moments: usize) -> Scene {
     let pose = |i: usize| {
         let at = i as f64 / (moments - 1) as f64;
         // Two sways sideways and three up and down, as of a hand-held camera.
-        let turn = |times: f64| sin_cos(std::f64::consts::PI * ((times * at) % 2.0 - 1.0)).0;
+        let turn = |times: f64| half_turns(times * at);
         let eye = [1.2 * (2.0 * at - 1.0) + 0.25 * turn(4.0), 1.2 + 0.2 * turn(6.0), 2.6 + 0.2 * turn(2.0)];
         camera(eye, [0.3 * (2.0 * at - 1.0), 0.8 + 0.05 * turn(6.0), -1.0])
     };
@@ -241,5 +255,56 @@ fn hand_held(moments: usize) -> Scene {
     let world = World { things: vec![floor(20.0), back_wall(), ball()] };
     // Both takes last the same time.
     let fps = (moments - 1) as f64 / 1.1;
-    Scene { world, viewers: vec![path, fixed], moments, fps, units: 1.0, moving_points: false, truth: true }
+    let points = POINTS;
+    Scene { world, viewers: vec![path, fixed], moments, fps, units: 1.0, points, moving_points: false, truth: true }
+}
+
+/// Minus the sine of a number of half turns.
+fn half_turns(turns: f64) -> f64 {
+    sin_cos(std::f64::consts::PI * (turns % 2.0 - 1.0)).0
+}
+
+/// A place in tenths of a unit, at all times.
+fn at<const X: i32, const Y: i32, const Z: i32>(_: f64) -> V3 {
+    [X, Y, Z].map(|v| 0.1 * f64::from(v))
+}
+
+/// A street: a railing close to the walker, stairs, houses on both sides, two round trees, a far horizon.
+fn street() -> World {
+    let part = |half: V3, seed: u64, grain: f64| move |place| thing(Shape::Crate(half), place, texture(seed, grain));
+    let posts = [at::<9, 5, -100>, at::<9, 5, -60>, at::<9, 5, -20>, at::<9, 5, 20>, at::<9, 5, 60>, at::<9, 5, 100>];
+    let bars = [at::<9, 10, 0>, at::<9, 6, 0>];
+    let houses = [at::<60, 30, -80>, at::<-70, 30, -70>, at::<65, 30, 40>, at::<-60, 30, 60>, at::<10, 30, -180>];
+    let steps: [(fn(f64) -> V3, f64); 4] =
+        [(at::<-22, 1, -20>, 0.1), (at::<-22, 2, -26>, 0.2), (at::<-22, 3, -32>, 0.3), (at::<-22, 4, -38>, 0.4)];
+    let trunks = [at::<-25, 8, 30>, at::<25, 8, -40>];
+    let crowns: [fn(f64) -> V3; 2] = [at::<-25, 20, 30>, at::<25, 20, -40>];
+    let things = [floor(40.0), dome(FAR * RADIUS)].into_iter();
+    let things = things.chain(posts.map(part([0.03, 0.5, 0.03], 2, 0.1)));
+    let things = things.chain(bars.map(part([0.02, 0.02, 11.0], 8, 0.2)));
+    let things = things.chain(houses.map(part([2.0, 3.0, 2.5], 1, 0.6)));
+    let things = things.chain(steps.map(|(place, height)| part([1.2, height, 0.3], 5, 0.3)(place)));
+    let things = things.chain(trunks.map(part([0.12, 0.8, 0.12], 6, 0.2)));
+    World { things: things.chain(crowns.map(|place| thing(Shape::Ball(0.8), place, texture(7, 0.3)))).collect() }
+}
+
+/// One camera that walks through the street, swaying, and looks to both sides.
+fn walk(moments: usize) -> Scene {
+    let pose = |i: usize| {
+        let at = i as f64 / (moments - 1) as f64;
+        let eye = [0.15 * half_turns(12.0 * at), 1.5 + 0.05 * half_turns(24.0 * at), WALKED * (0.5 - at)];
+        let [x, y, z] = eye;
+        camera(eye, [x + 0.9 * half_turns(4.0 * at), y - 0.25, z - 3.0])
+    };
+    let path = Viewer { poses: (0..moments).map(pose).collect(), ..Viewer::fixed(pose(0)) };
+    Scene {
+        world: street(),
+        viewers: vec![path],
+        moments,
+        fps: 10.0,
+        units: 1.0,
+        points: WALK_POINTS * moments,
+        moving_points: true,
+        truth: false,
+    }
 }

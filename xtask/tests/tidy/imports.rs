@@ -154,6 +154,8 @@ const ORDER: [(&str, &[&str]); 9] = [
             "picking",
             "editor",
             "aligning",
+            "models",
+            "priors",
             "recipe_schema",
             "texts",
         ],

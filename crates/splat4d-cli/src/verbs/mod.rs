@@ -18,6 +18,7 @@ pub(crate) mod left_out;
 pub(crate) mod localise;
 #[cfg(feature = "dynamics")]
 pub(crate) mod predict;
+pub(crate) mod priors;
 pub(crate) mod recipe;
 pub(crate) mod render;
 pub(crate) mod status;

@@ -8,7 +8,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawCapture, RawFrame,
     Rig, Split, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
+use super::{borders, computed, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
 use rayon::prelude::*;
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
@@ -16,6 +16,7 @@ use splat4d::{Error, Result};
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Every how many images one is held out where no rig and no convention states otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
@@ -37,6 +38,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     skip_missing(&mut take, options).map_err(located)?;
     skip_repeated(&mut take);
     masks::fill(&mut take)?;
+    computed::fill(&mut take)?;
     let in_part = take.take != Extent::default();
     if !in_part {
         drop_unused_cameras(&mut take, &used);
@@ -56,7 +58,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     let cameras = rigs(&take);
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
-    if take.points.is_none() && !in_part {
+    if take.points.is_none() && take.geometry.is_none() && !in_part {
         unread_clouds(&mut take);
     }
     let (has_alpha, turned, unsure) = fit_pictures(&mut take, options)?;
@@ -98,6 +100,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
         timing: take.timing,
         fps: take.fps,
         points,
+        geometry: take.geometry.map(|g| Arc::new(g.relative_to(offset))),
         background,
         up,
         offset,
@@ -112,6 +115,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     };
     settle_orientation(&mut capture, &unsure);
     borders::find(&mut capture, options, &firsts);
+    join_geometry(&mut capture, options)?;
     for remark in &capture.account {
         let list = if remark.severity == Severity::Warning { &mut capture.warnings } else { &mut capture.notes };
         list.push(remark.what.clone());
@@ -124,6 +128,21 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
         all.retain(|&i| options.lists(frames[i].index));
     }
     Ok(capture)
+}
+
+/// Adds points of measured geometry to the capture's own.
+fn join_geometry(capture: &mut Capture, options: &CaptureOptions) -> Result<()> {
+    let Some(geometry) = capture.geometry.clone() else { return Ok(()) };
+    if options.max_points == 0 || capture.train.is_empty() {
+        return Ok(());
+    }
+    let (cloud, note) = geometry.cloud(capture)?;
+    capture.notes.push(note);
+    let points = capture.points.get_or_insert_default();
+    points.points.extend(cloud.points);
+    points.colors.extend(cloud.colors);
+    points.times.extend(cloud.times);
+    Ok(())
 }
 
 /// Names point clouds next to the capture's files, where it has no points: nothing states that they are in its world.

@@ -45,11 +45,35 @@ pub struct DepthFile {
     pub scale: f64,
     /// Its kind.
     pub kind: DepthKind,
+    /// How a map that was known up to a scale and a shift became metric.
+    pub(crate) fit: Option<DepthFit>,
+}
+
+/// Metric depth from a map that is known up to a scale and a shift.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct DepthFit {
+    /// Whether `scale`·m + `shift` is an inverse depth.
+    pub inverse: bool,
+    /// Scene units (or their inverse) per number.
+    pub scale: f64,
+    /// What 0 would be.
+    pub shift: f64,
+    /// Nearest and farthest depths that are believed; others are not known.
+    pub range: [f64; 2],
+}
+
+impl DepthFit {
+    /// The depth that a number means, 0: not known.
+    fn depth(&self, number: f64) -> f32 {
+        let value = self.scale * number + self.shift;
+        let depth = if self.inverse { 1.0 / value } else { value };
+        if (self.range[0]..=self.range[1]).contains(&depth) { depth as f32 } else { 0.0 }
+    }
 }
 
 /// A frame's depth, [height, width] of its view, 0: not known. Errors: no depth map, of another shape than the image,
 /// numbers that are none.
-pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<Vec<f32>> {
+pub(crate) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<Vec<f32>> {
     let source = &frame.source;
     let map = Map::read(file, source)?;
     check(&map, file)?;
@@ -118,7 +142,12 @@ impl Map {
             }
             _ => Self::picture(file, source)?,
         };
-        let known = |v: f32| if v >= NOWHERE { 0.0 } else { (f64::from(v) * file.scale) as f32 };
+        let known = |v: f32| match file.fit {
+            _ if v >= NOWHERE => 0.0,
+            Some(_) if v == 0.0 || v.is_nan() => v,
+            Some(fit) => fit.depth(f64::from(v) * file.scale),
+            None => (f64::from(v) * file.scale) as f32,
+        };
         map.values.iter_mut().for_each(|v| *v = known(*v));
         Ok(map)
     }
@@ -152,7 +181,9 @@ impl Map {
         let values = match raster.samples {
             Samples::Sixteen(v) => v.into_iter().map(f32::from).collect(),
             // Networks' depth is often stored so; 255 steps are too few for lengths.
-            Samples::Eight(v) if file.kind != DepthKind::Metric => v.into_iter().map(f32::from).collect(),
+            Samples::Eight(v) if file.kind != DepthKind::Metric || file.fit.is_some() => {
+                v.into_iter().map(f32::from).collect()
+            }
             Samples::Eight(_) => return bad("the depth map has 8 bits, not 16".into()),
         };
         Ok(Self { width: raster.width, height: raster.height, values })

@@ -19,6 +19,8 @@ pub struct Picture {
     pub weight: Option<Planes<f32>>,
     /// Its depth, where known.
     pub depth: Option<Depth>,
+    /// Depth of the capture's measured geometry, [1, h, w]; 0: not measured.
+    pub measured: Option<Planes<f32>>,
     /// Its optical flow, where known.
     pub flow: Option<Flow>,
     /// Its shutter, where that is not ideal.
@@ -48,13 +50,12 @@ impl Depth {
     pub(crate) fn truth(&self) -> DepthTruth<'_> {
         DepthTruth { values: &self.values, kind: self.kind }
     }
+}
 
-    /// Largest ratio of depths of four pixels on one surface.
-    fn halve(&mut self) {
-        let map = &mut self.values;
-        map.data = depth::reduce(&map.data, map.width, map.height, 2);
-        (map.width, map.height) = (map.width / 2, map.height / 2);
-    }
+/// Halves a depth map: means of four pixels on one surface.
+fn halve_depth(map: &mut Planes<f32>) {
+    map.data = depth::reduce(&map.data, map.width, map.height, 2);
+    (map.width, map.height) = (map.width / 2, map.height / 2);
 }
 
 /// Known optical flow of an image, for a loss.
@@ -106,12 +107,18 @@ impl Flow {
 }
 
 impl Picture {
+    /// The measured depth, as losses take it.
+    pub(crate) fn measured(&self) -> Option<DepthTruth<'_>> {
+        self.measured.as_ref().map(|values| DepthTruth { values, kind: DepthKind::Metric })
+    }
+
     /// Half the size: the mean of 2x2 boxes, an odd last row or column left out (as `Camera::downscaled`).
     pub(crate) fn halve(&mut self) {
         self.color.halve();
         self.mask.as_mut().map(Planes::halve);
         self.weight.as_mut().map(Planes::halve);
-        self.depth.as_mut().map(Depth::halve);
+        let maps = self.depth.as_mut().map(|d| &mut d.values).into_iter().chain(&mut self.measured);
+        maps.for_each(halve_depth);
         self.flow.as_mut().map(Flow::halve);
     }
 }

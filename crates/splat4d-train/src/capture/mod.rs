@@ -10,6 +10,7 @@ mod assemble;
 mod borders;
 mod colmap;
 mod colmap_files;
+mod computed;
 mod convention;
 mod depth;
 mod elsewhere;
@@ -20,6 +21,7 @@ pub(crate) mod features;
 pub(crate) mod flow;
 mod foreign;
 pub mod frames;
+mod geometry;
 mod json;
 pub(crate) mod labels;
 mod layout;
@@ -55,8 +57,10 @@ mod transforms;
 pub use account::{Aspect, Remark, Severity};
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
+pub(crate) use depth::{DepthFit, read as depth_map};
 pub use evidence::{Agreement, PoseCheck};
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
+pub use geometry::Geometry;
 pub use lens::Distortion;
 pub use n3dv::{about_rows, rows_of};
 pub use options::{
@@ -245,6 +249,8 @@ pub struct Capture {
     pub fps: f64,
     /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
     pub points: Option<PointCloud>,
+    /// A scan or a mesh that constrains depth during training.
+    pub geometry: Option<Arc<Geometry>>,
     /// The background of transparent pixels, sRGB from 0 to 1; `None`: the images have no alpha.
     pub background: Option<[f32; 3]>,
     /// Offset subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
@@ -288,6 +294,7 @@ struct RawCapture {
     hold_out: Option<HoldOut>,
     fps: f64,
     points: Option<PointCloud>,
+    geometry: Option<Geometry>,
     /// Files named in its metadata that were read and are no frame's.
     files: Vec<PathBuf>,
     background: Option<[f32; 3]>,
@@ -316,6 +323,7 @@ impl RawCapture {
             hold_out: None,
             fps: DEFAULT_FPS,
             points: None,
+            geometry: None,
             files: Vec::new(),
             background: None,
             up: None,

@@ -5,6 +5,7 @@ use super::{Capture, RawCapture};
 use splat4d::math::Se3;
 use splat4d::math::se3::{mat_vec, sub};
 use splat4d::scene::offset::offset_of;
+use std::sync::Arc;
 
 /// Subtracts the offset that the capture needs from its poses and points, and returns it: zero near the origin, where every
 /// bit stays.
@@ -58,6 +59,7 @@ impl Capture {
         if let Some(points) = &mut self.points {
             points.subtract(by);
         }
+        self.geometry = self.geometry.as_ref().map(|g| Arc::new(g.relative_to(offset)));
         self.offset = offset;
     }
 }

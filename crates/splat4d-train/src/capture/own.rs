@@ -2,17 +2,19 @@
 
 use super::account::Account;
 use super::convention::Convention;
+use super::geometry::Scans;
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_cloud;
 use super::{
-    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawCapture, RawFrame, Tracks, pose, shutter,
+    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, Geometry, HoldOut, RawCapture, RawFrame, Tracks, pose,
+    shutter,
 };
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -28,6 +30,7 @@ const TOP_KEYS: &[&str] = &[
     "cameras",
     "hold_out",
     "points",
+    "geometry",
     "background",
     "up",
     "labels",
@@ -125,6 +128,9 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
     let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
     let points = top.opt("points")?.map(|n| lookup.file(n.text()?)).transpose()?;
     let sound = top.opt("sound")?.map(|n| read_sound(root, &n)).transpose()?;
+    let numbers: BTreeSet<usize> = frames.iter().map(|f: &RawFrame| f.index).collect();
+    let geometry = top.opt("geometry")?.map(|n| read_geometry(&lookup, top, &n, &numbers)).transpose()?;
+    let scans: Vec<PathBuf> = geometry.iter().flat_map(Geometry::files).cloned().collect();
     Ok(RawCapture {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         cameras,
@@ -135,7 +141,8 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
         hold_out,
         fps,
         points: points.as_deref().map(read_cloud).transpose()?,
-        files: points.into_iter().chain(sound).collect(),
+        files: points.into_iter().chain(sound).chain(scans).collect(),
+        geometry,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
@@ -164,6 +171,53 @@ fn in_part(top: &Node<'_>, nodes: &[Node<'_>], stated: Option<&HoldOut>, options
         }
     }
     Ok(true)
+}
+
+/// Measured geometry: a file, a pattern or a list of files, or an object of these with a transform. `frames`: numbers of
+/// the frames that are listed.
+fn read_geometry(lookup: &Lookup, top: &Node<'_>, node: &Node<'_>, frames: &BTreeSet<usize>) -> Result<Geometry> {
+    let whole = node.value.is_object();
+    if whole {
+        node.only(&["files", "transform", "start"])?;
+    }
+    let named = if whole { node.get("files")? } else { node.clone() };
+    let of = |key: &str| if whole { node.opt(key) } else { Ok(None) };
+    let start = of("start")?.or(top.opt("start")?).map(|n| n.count()).transpose()?.unwrap_or(0);
+    let identity = std::array::from_fn(|i| std::array::from_fn(|k| f64::from(u8::from(i == k))));
+    let transform = of("transform")?.map_or(Ok(identity), |n| n.matrix4())?;
+    let missing = |path: &Path| {
+        let error = named.error("the file of measured geometry is missing").at(path.display());
+        error.remedy("Restore it, or take \"geometry\" out of capture.json")
+    };
+    let single = named.value.as_str().map(|text| lookup.file(text)).transpose()?;
+    let single = single.filter(|path| path.is_file() || !named.value.as_str().is_some_and(|t| t.contains('%')));
+    let scans = if let Some(path) = single {
+        if !path.is_file() {
+            return Err(missing(&path));
+        }
+        Scans::Static(path)
+    } else {
+        let files = Files::read(&named)?;
+        let mut paths = BTreeMap::new();
+        for &index in frames {
+            let Some(path) = files.path(lookup, start, index)? else {
+                let what = format!("\"geometry\" lists no file for frame {index}");
+                return Err(named.error(what).remedy("List one file per frame, or name one file for all frames"));
+            };
+            match (path.is_file(), &files) {
+                (true, _) => drop(paths.insert(index, path)),
+                // A scanner is slower than cameras.
+                (false, Files::Pattern { .. }) => {}
+                (false, Files::List(_)) => return Err(missing(&path)),
+            }
+        }
+        if paths.is_empty() {
+            let first = frames.first().and_then(|&i| files.path(lookup, start, i).transpose()).transpose()?;
+            return Err(missing(&first.unwrap_or_default()));
+        }
+        Scans::Frames(paths)
+    };
+    Geometry::new(scans, transform).map_err(|e| node.at(e))
 }
 
 /// The file of the sound. Training does not use it, so that it may be missing.
@@ -415,7 +469,7 @@ impl Depth {
 
     fn file(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<DepthFile>> {
         let path = self.files.path(lookup, start, index)?;
-        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind }))
+        Ok(path.map(|path| DepthFile { path, scale: self.scale, kind: self.kind, fit: None }))
     }
 }
 

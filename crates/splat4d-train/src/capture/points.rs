@@ -26,18 +26,22 @@ const UNREAD: [(&[u8], &str); 6] = [
 
 /// Reads the points of a .ply, .npy or .npz file, whatever its name, with their colours and, where a .ply states them, their times.
 pub(super) fn read_cloud(path: &Path) -> Result<PointCloud> {
-    let bytes = read_bytes(path)?;
-    let read = match &bytes[..] {
-        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Npy::read(&bytes).and_then(|array| of_array(&array)),
-        [b'P', b'K', 3 | 5, ..] => of_archive(&bytes),
-        _ if bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes).starts_with(b"ply")
+    surface(&read_bytes(path)?, path).map(|read| read.0).map_err(|e| e.at(path.display()))
+}
+
+/// The same of a file's bytes, and the triangles between the points of a mesh.
+pub(super) fn surface(bytes: &[u8], path: &Path) -> Result<(PointCloud, Vec<[u32; 3]>)> {
+    let of_cloud = |cloud| (cloud, Vec::new());
+    match bytes {
+        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Npy::read(bytes).and_then(|array| of_array(&array)).map(of_cloud),
+        [b'P', b'K', 3 | 5, ..] => of_archive(bytes).map(of_cloud),
+        _ if bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).starts_with(b"ply")
             || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) =>
         {
-            cloud(&bytes)
+            of_ply(bytes)
         }
-        _ => Err(unread(&bytes)),
-    };
-    read.map_err(|e| e.at(path.display()))
+        _ => Err(unread(bytes)),
+    }
 }
 
 /// Why a file of points is not read.
@@ -47,7 +51,7 @@ fn unread(bytes: &[u8]) -> Error {
     let what = known.unwrap_or_else(|| if text() { "text" } else { "a file of another kind" });
     Error::input(format!("expected points as .ply, .npy or .npz, found {what}")).remedy(
         "Convert it to .ply with CloudCompare or MeshLab, or save an array of shape [points, 3], or [points, 6] with colours, with \
-         numpy.save",
+         numpy.save. Scans as .las, .pcd or .e57 are read as \"geometry\" of capture.json (docs/priors.md)",
     )
 }
 
@@ -79,7 +83,7 @@ fn of_array(array: &Npy) -> Result<PointCloud> {
     Ok(cloud)
 }
 
-fn cloud(bytes: &[u8]) -> Result<PointCloud> {
+fn of_ply(bytes: &[u8]) -> Result<(PointCloud, Vec<[u32; 3]>)> {
     let read = ply::read_points(&plain_names(bytes))?;
     let white = white_of(read.colors.iter().flatten().copied());
     let mut cloud = PointCloud::default();
@@ -89,7 +93,7 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
         let seen = seen.filter(|t| !t.is_nan());
         cloud.push(*point, read.colors.get(i).map_or([GREY; 3], |c| c.map(|v| v / white)), seen);
     }
-    Ok(cloud)
+    Ok((cloud, read.triangles))
 }
 
 /// The number that represents full colour in colours of floating point: 1, or 255 where most are above 1.
@@ -253,6 +257,10 @@ type Cell = (u64, Option<u64>);
 mod tests {
     use super::*;
 
+    fn cloud(bytes: &[u8]) -> Result<PointCloud> {
+        of_ply(bytes).map(|read| read.0)
+    }
+
     #[test]
     fn ascii_and_binary_agree_whatever_the_order() {
         let ascii = "ply\nformat ascii 1.0\ncomment made up\nelement vertex 3\nproperty uchar red\n\
@@ -288,9 +296,9 @@ mod tests {
             times: vec![None, Some(0.3)],
             left_out: 0,
         };
-        assert_eq!(super::cloud(&cloud.to_ply("comment made up")).unwrap(), cloud);
+        assert_eq!(of_ply(&cloud.to_ply("comment made up")).unwrap().0, cloud);
         let none = PointCloud::default();
-        assert_eq!(super::cloud(&none.to_ply("comment made up")).unwrap(), none);
+        assert_eq!(of_ply(&none.to_ply("comment made up")).unwrap().0, none);
     }
 
     #[test]
@@ -343,7 +351,7 @@ mod tests {
         assert!(cloud.loss().unwrap().contains("5 of 8"), "{:?}", cloud.loss());
         let ply = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n\
                    end_header\n1e39 0 0\n0 0 0\n";
-        assert_eq!(super::cloud(ply.as_bytes()).unwrap().left_out, 1, "beyond 32-bit floats");
+        assert_eq!(of_ply(ply.as_bytes()).unwrap().0.left_out, 1, "beyond 32-bit floats");
     }
 
     #[test]

@@ -5,9 +5,10 @@
 //! was composited, resampled or averaged is kept in 16 bits, whose rounding (1/131070) is far below the half 8-bit step
 //! (1/510) that an 8-bit copy would lose, at half the memory of f32.
 
+use super::geometry::DepthMap;
 use super::lens::Distortion;
 use super::picture::{self, Raster, Samples};
-use super::{Capture, DepthKind, Frame, depth, flow, panorama};
+use super::{Capture, DepthKind, Frame, Split, depth, flow, panorama};
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::math::image::box_means;
@@ -47,6 +48,8 @@ pub struct StoredPicture {
     depth: Option<(Vec<f32>, DepthKind)>,
     /// As [`flow::read`] gives it.
     flow: Option<Vec<u16>>,
+    /// Depth of the capture's geometry; images that are not trained on have none.
+    measured: Option<Arc<DepthMap>>,
 }
 
 impl StoredPicture {
@@ -58,7 +61,8 @@ impl StoredPicture {
         };
         let weights = [&self.mask, &self.valid].into_iter().flatten().map(Vec::len).sum::<usize>();
         let depth = self.depth.as_ref().map_or(0, |(d, _)| 4 * d.len());
-        color + weights + depth + self.flow.as_ref().map_or(0, |f| 2 * f.len())
+        let measured = self.measured.as_ref().map_or(0, |m| m.bytes());
+        color + weights + depth + measured + self.flow.as_ref().map_or(0, |f| 2 * f.len())
     }
 
     /// Writes the colour as [3, height, width] sRGB values from 0 to 1, reusing `out`'s memory.
@@ -91,6 +95,13 @@ impl StoredPicture {
     pub(crate) fn flow_into(&self, out: &mut Planes<f32>) -> bool {
         let Some(codes) = &self.flow else { return false };
         flow::decode_into(codes, self.width, self.height, out);
+        true
+    }
+
+    /// Writes the measured depth as [1, height, width]; false (and `out` untouched) if there is none.
+    pub(crate) fn measured_into(&self, out: &mut Planes<f32>) -> bool {
+        let Some(map) = &self.measured else { return false };
+        map.write_into(out);
         true
     }
 
@@ -304,9 +315,22 @@ impl Shared {
         let _loading = Loading(self, frame);
         // On this thread alone: one that shared the work with others could be given a job that waits for this very
         // image.
-        let picture = Arc::new(prepare(&self.capture.frames[frame], &self.capture)?);
+        let mut picture = prepare(&self.capture.frames[frame], &self.capture)?;
+        picture.measured = self.measured(frame)?;
+        let picture = Arc::new(picture);
         self.keep(frame, &picture);
         Ok(picture)
+    }
+
+    /// Depth of the capture's geometry in a training image.
+    fn measured(&self, number: usize) -> Result<Option<Arc<DepthMap>>> {
+        let (capture, frame) = (&self.capture, &self.capture.frames[number]);
+        let Some(geometry) = capture.geometry.as_ref().filter(|_| capture.split(number) == Split::Train) else {
+            return Ok(None);
+        };
+        let camera = &capture.cameras[frame.camera];
+        let place = |e: splat4d::Error| e.at(format!("camera {}, frame {}", camera.name, frame.index));
+        geometry.depth(frame, camera.fixed).map_err(place)
     }
 
     fn keep(&self, frame: usize, picture: &Arc<StoredPicture>) {
@@ -380,7 +404,8 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
         let color = Samples::Eight(planar(samples, raster.channels));
         let valid = frame.recorded.as_ref().map(|r| r.iter().map(|&v| v * u8::MAX).collect());
-        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid, depth, flow });
+        let (width, height) = (raster.width, raster.height);
+        return Ok(StoredPicture { width, height, color, mask, valid, depth, flow, measured: None });
     }
     let (stored_width, stored_height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
@@ -401,7 +426,9 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     // Any doubt about a pixel must not round to certainty.
     let valid = valid.map(|plane| plane.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0) as u8).collect());
     let color = planes.iter().flatten().map(|&v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect();
-    Ok(StoredPicture { width: width / k, height: height / k, color: Samples::Sixteen(color), mask, valid, depth, flow })
+    let color = Samples::Sixteen(color);
+    let measured = None;
+    Ok(StoredPicture { width: width / k, height: height / k, color, mask, valid, depth, flow, measured })
 }
 
 fn to_byte(v: f32) -> u8 {

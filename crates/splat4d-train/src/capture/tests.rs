@@ -6,6 +6,7 @@ mod far;
 mod flow;
 mod forgiving;
 mod found;
+mod geometry;
 mod labels;
 mod layouts;
 mod mutants;

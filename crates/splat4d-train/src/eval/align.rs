@@ -97,6 +97,7 @@ impl Align {
                     weight,
                     depth: None,
                     flow: None,
+                    measured: None,
                     tracks: None,
                     frame: place,
                     rig: frame.camera,

@@ -17,7 +17,7 @@ const OUT: usize = 3;
 const SINGULAR: f64 = 1e-12;
 
 /// A map of a render's colour r: row c is `[m0, m1, m2, offset]`, and channel c becomes m·r + offset.
-pub type ColourMatrix = [[f64; IN]; OUT];
+pub(crate) type ColourMatrix = [[f64; IN]; OUT];
 
 /// The matrix that changes nothing.
 pub(super) const IDENTITY: ColourMatrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];

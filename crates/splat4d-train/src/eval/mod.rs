@@ -18,7 +18,6 @@ pub mod tracks;
 pub mod trajectory;
 
 pub use align::Align;
-pub use colour::ColourMatrix;
 pub use lpips::{InputScaling, Lpips};
 pub use report::{CameraScores, Conditions, Report, Score, Split, View};
 

@@ -1,6 +1,6 @@
 //! `results.json` and `per_view.json`.
 
-use super::ColourMatrix;
+use super::colour::ColourMatrix;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 

@@ -5,6 +5,7 @@ mod depth;
 pub(crate) mod fill;
 pub(crate) mod hull;
 mod map;
+pub(crate) mod scan;
 mod scene_flow;
 pub(crate) mod volume;
 

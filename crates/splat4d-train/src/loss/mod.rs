@@ -67,6 +67,9 @@ settings! {
         /// Weight of the rendered depth against the capture's depth maps (capture.json: `depth`); decays to a tenth by
         /// the end.
         depth: f64 = 0.1;
+        /// Weight of the rendered depth against measured geometry (capture.json: `geometry`), the same during the whole
+        /// run; 0: a scan only gives initial points.
+        geometry: f64 = 0.1;
         /// Weight of the rendered flow against the known one, shares of the image's longer side (capture.json: `flow`).
         flow: f64 = 0.0;
         /// Weight of the rendered displacement of tracked points against their tracks, shares of the image's longer

@@ -3,8 +3,10 @@
 //!
 //! Gaussians with a lifespan and a path of their own that leave their own place within that life are split in time
 //! instead: the two halves follow the same path one after the other. Rotation and acceleration need shorter lifespans,
-//! which parts next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well,
-//! at random.
+//! which parts next to each other do not bring. So are those whose loss changes much if their lifespan shifts by its width:
+//! some of their times need them and others need them gone, as where an object appears or vanishes, and only shorter
+//! lifespans do both. Gaussians of four dimensions (Yang et al. 2024) split in time as well: at random, and by a threshold of
+//! their gradient in time.
 //!
 //! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and
 //! a wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
@@ -52,8 +54,15 @@ settings! {
         full_at: f64 = 0.5 => share();
         /// A Gaussian that moves further than this within its lifespan is split in time; 0: never.
         split_in_time: f64 = 1.0 => any().unit("own sizes");
+        /// Change of the loss (root mean square over views) if a lifespan shifts by its width, above which a Gaussian is
+        /// split in time; 0: never.
+        life_threshold: f64 = LIFE_THRESHOLD;
     }
 }
+
+/// Half of the residual of what vanishes is gone at this threshold, and nothing else is lost; at half of it a hall lost
+/// 0.15 dB (studies/records/2026-11-28-lifespans.md).
+const LIFE_THRESHOLD: f64 = 1e-4;
 
 /// [`AdcSettings::percent_dense`] where it is 0, for few Gaussians (Kerbl et al. 2023).
 pub(crate) const DENSE: f64 = 0.01;
@@ -121,18 +130,21 @@ impl Adc {
 }
 
 impl AdcSettings {
-    /// How far from the centre of a row's lifespan those of its halves lie, seconds; 0: no split in time.
-    fn part(&self, scene: &Scene<f32>, layer: usize, row: usize, size: f64) -> f64 {
+    /// Width of a row's lifespan, seconds, at most half the clip; none: it cannot be split in time.
+    fn width(scene: &Scene<f32>, layer: usize, row: usize) -> Option<f64> {
         let Layer { motion, params, life, .. } = &scene.layers[layer];
-        let Some(path) = motion.polynomial().filter(|_| *life != LifeKind::Infinite && self.split_in_time > 0.0) else {
-            return 0.0;
-        };
+        motion.polynomial().filter(|_| *life != LifeKind::Infinite)?;
         // A lifespan that is longer than the clip counts as the clip.
         let clip = 0.5 * (scene.clip[1] - scene.clip[0]);
-        let width = f64::from(params[LIFE].get(row, LOG_WIDTH)).exp().min(clip);
-        let way = path.travel(params, row, width);
-        let goes = way.iter().map(|x| x * x).sum::<f64>().sqrt();
-        if goes > self.split_in_time * size { TIME_SHIFT * width } else { 0.0 }
+        Some(f64::from(params[LIFE].get(row, LOG_WIDTH)).exp().min(clip))
+    }
+
+    /// Whether a row leaves its own place within its life.
+    fn leaves(&self, scene: &Scene<f32>, layer: usize, row: usize, size: f64, width: f64) -> bool {
+        let Layer { motion, params, .. } = &scene.layers[layer];
+        let path = motion.polynomial().expect("a row with a width has a path");
+        let goes = path.travel(params, row, width).iter().map(|x| x * x).sum::<f64>().sqrt();
+        self.split_in_time > 0.0 && goes > self.split_in_time * size
     }
 
     fn layer(
@@ -151,18 +163,33 @@ impl AdcSettings {
         let keep: Vec<bool> = (0..rows).map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r])).collect();
         let removed = keep.iter().filter(|k| !**k).count();
         *spare += removed;
+        let moments = &train_state.moments()[layer];
+        // Shares of the two thresholds that a row reaches.
+        let needs: Vec<[f64; 2]> = (0..rows)
+            .map(|r| {
+                let gradient = f64::from(stats.gradient(layer, r));
+                let own = if gradient >= self.grad_threshold { (gradient / self.grad_threshold).max(1.0) } else { 0.0 };
+                let width = Self::width(scene, layer, r).filter(|_| self.life_threshold > 0.0);
+                [own, width.map_or(0.0, |width| width * moments.rms(LIFE, r, CENTER) / self.life_threshold)]
+            })
+            .collect();
         // Those that need it most come first when the cap leaves no room for all.
-        let mut wanting: Vec<(f32, u32)> = (0..rows)
-            .filter(|&r| keep[r] && f64::from(stats.gradient(layer, r)) >= self.grad_threshold)
-            .map(|r| (stats.gradient(layer, r), r as u32))
+        let mut wanting: Vec<(f64, u32)> = (0..rows)
+            .map(|r| (needs[r][0].max(needs[r][1]), r as u32))
+            .filter(|&(need, r)| keep[r as usize] && need >= 1.0)
             .collect();
         wanting.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         wanting.truncate((*spare as f64 * share).ceil() as usize);
         *spare -= wanting.len();
         let mut grows = vec![false; rows];
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
-        let parted: Vec<f64> =
-            (0..rows).map(|r| if grows[r] { self.part(scene, layer, r, sizes[r]) } else { 0.0 }).collect();
+        // How far from the centre of a row's lifespan those of its halves lie, seconds; 0: no split in time.
+        let apart = |r: usize| {
+            let width = Self::width(scene, layer, r).filter(|_| grows[r])?;
+            let parted = needs[r][1] >= 1.0 || self.leaves(scene, layer, r, sizes[r], width);
+            parted.then_some(TIME_SHIFT * width)
+        };
+        let parted: Vec<f64> = (0..rows).map(|r| apart(r).unwrap_or(0.0)).collect();
         let dense = if self.percent_dense == 0.0 { DENSE } else { self.percent_dense };
         let large = |r: usize| sizes[r] > dense * limits.extent;
         let splits: Vec<bool> = (0..rows).map(|r| grows[r] && (parted[r] > 0.0 || large(r))).collect();
@@ -309,6 +336,37 @@ mod tests {
         let never = AdcSettings { split_in_time: 0.0, ..settings };
         let (_, all) = run(s, never, 0..3, limits);
         assert!((0..7).all(|r| all.layers[0].params[LIFE].get(r, CENTER) == 2.5), "0: nothing is split in time");
+    }
+
+    #[test]
+    fn gaussians_that_some_times_need_and_others_do_not_are_split_in_time() {
+        let mut s = scene(3);
+        s.clip = [0.0, 4.0];
+        let layer = &mut s.layers[0];
+        layer.motion = build(&Spec::Spacetime(SpacetimeSpec::default()), &mut layer.params).unwrap();
+        layer.life = LifeKind::GaussHalf;
+        layer.params[LIFE] = Table::new(LifeKind::GaussHalf.columns(), 3);
+        (0..3).for_each(|row| layer.params[LIFE].write(row, 0, [2.0, 0.5f32.ln()]));
+        let splits = |settings: AdcSettings| {
+            let mut train_state = TrainState::new(s.clone());
+            // A shift by the width of half a second changes the loss by 2 and by half of the threshold; row 2 has learnt
+            // nothing yet.
+            for (row, rms) in [4e-4f32, 1e-4].into_iter().enumerate() {
+                let moments = &mut train_state.tables_mut().1[0];
+                moments.table_mut(LIFE).write(row, 0, [0.0, 0.0, rms * rms, 0.0, 1e4]);
+            }
+            let limits = Limits { cap: 100, extent: 4.0, min_opacity: 0.005 };
+            let change = Adc { settings, steps: Every::NEVER }.run(&mut train_state, &context(limits, 1, 0)).unwrap();
+            let life = train_state.scene().layers[0].params[LIFE].clone();
+            (change.added, (0..life.rows()).map(|row| life.get(row, CENTER)).collect::<Vec<_>>())
+        };
+        let (added, centers) = splits(AdcSettings::default());
+        assert_eq!(added, 1);
+        assert!((centers[0] - 1.61).abs() < 1e-5 && (centers[3] - 2.39).abs() < 1e-5, "{centers:?}");
+        assert_eq!(centers[1..3], [2.0; 2]);
+        assert_eq!(splits(AdcSettings { life_threshold: 0.0, ..AdcSettings::default() }), (0, vec![2.0; 3]));
+        let other = AdcSettings { grad_threshold: 0.0, life_threshold: 0.0, ..AdcSettings::default() };
+        assert_eq!(splits(other).0, 3, "without a threshold in space all grow");
     }
 
     #[test]

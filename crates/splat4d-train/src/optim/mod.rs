@@ -77,6 +77,17 @@ impl<F: Real> Moments<F> {
         table
     }
 
+    /// Root mean square of the gradients of one value over about a hundred of its row's last steps; 0 before the first.
+    pub(crate) fn rms(&self, key: Key, row: usize, column: usize) -> f64 {
+        let table = self.table(key);
+        let width = table.width() / 2;
+        let steps = if table.rows() == 0 { 0.0 } else { table.get(row, 2 * width).f64() };
+        if steps == 0.0 {
+            return 0.0;
+        }
+        (table.get(row, width + column).f64() / (1.0 - GAUSSIANS[1].powf(steps))).sqrt()
+    }
+
     /// Resets the moments of pages for which `learns` (of one of their column groups) does not hold: a frame that was
     /// tracked does not learn again.
     pub(crate) fn forget_pages(&mut self, p: &Params<F>, learns: impl Fn(&str) -> bool) {

@@ -74,6 +74,7 @@ impl Frames for Dataset {
         fill(&mut out.weight, |plane| stored.valid_into(plane));
         let mut values = out.depth.take().map(|d| d.values).unwrap_or_default();
         out.depth = stored.depth_into(&mut values).map(|kind| Depth { values, kind });
+        fill(&mut out.measured, |plane| stored.measured_into(plane));
         let mut vectors = out.flow.take().map(|f| f.vectors).unwrap_or_default();
         if let (Some(file), true) = (&self.capture.frames[frame].flow, stored.flow_into(&mut vectors)) {
             let to = &self.capture.frames[file.to];

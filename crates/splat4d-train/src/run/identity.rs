@@ -31,6 +31,7 @@ pub(super) fn fingerprint(capture: &Capture) -> String {
         let image = f.image.strip_prefix(&capture.root).unwrap_or(&f.image);
         text += &format!("{image:?} {:?} {:?};", f.view, f.time);
     }
+    text.extend(capture.geometry.as_ref().map(|g| g.mark(&capture.root)));
     hash(&text)
 }
 

@@ -17,6 +17,8 @@ const RENDER_BYTES: u64 = 1200;
 const PIXEL_BYTES: u64 = 200;
 /// Bytes a pixel takes in the image store: colour of 8 bits, or of 16 where images are reduced, and a mask.
 const STORED_BYTES: [u64; 2] = [4, 7];
+/// The same of measured depth; and a scan, next to the part of it that is read at a time.
+const MEASURED_BYTES: [u64; 2] = [2, 32 << 20];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
 const PROCESS_BYTES: u64 = 80 << 20;
@@ -47,9 +49,10 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let cap = recipe.densify.max_cap as u64;
     let frame = frames().map(|f| (f.view.width * f.view.height) as u64).max();
     let pixels = frame.unwrap_or(0);
-    let stored = STORED_BYTES[usize::from(capture.downscale > 1)];
+    let [measured, scan] = if capture.geometry.is_some() { MEASURED_BYTES } else { [0, 0] };
+    let stored = STORED_BYTES[usize::from(capture.downscale > 1)] + measured;
     let images = (pixels * stored * capture.train.len() as u64).min(recipe.run.image_memory);
-    let sum = PROCESS_BYTES + images + pixels * PIXEL_BYTES * recipe.run.batch_size as u64 + cap * RENDER_BYTES;
+    let sum = PROCESS_BYTES + scan + images + pixels * PIXEL_BYTES * recipe.run.batch_size as u64 + cap * RENDER_BYTES;
     if capture.train.is_empty() {
         return sum;
     }

@@ -1,5 +1,6 @@
 //! The run on disk: a folder with its recipe, checkpoints, metrics and scene; resume, rollback, `--minutes`.
 
+mod aligned;
 mod budget;
 pub mod checkpoint;
 pub mod chunks;
@@ -11,6 +12,7 @@ mod flows;
 mod identity;
 mod info;
 mod left;
+mod measured;
 mod memory;
 mod metrics;
 mod minutes;

@@ -71,6 +71,9 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lens
     if recipe.loss.depth == 0.0 {
         capture.frames.iter_mut().for_each(|f| f.depth = None);
     }
+    if recipe.loss.geometry == 0.0 {
+        capture.geometry = None;
+    }
     if recipe.capture.first_frame > 0 || recipe.capture.max_frames > 0 {
         let last = if recipe.capture.max_frames == 0 {
             usize::MAX
@@ -260,6 +263,10 @@ impl OpenCapture {
         } else {
             self.capture.points.as_ref().map(Seeds::of)
         };
+        let mut points = points;
+        if let (Some(points), true) = (&mut points, self.capture.geometry.is_some()) {
+            init::scan::colour(self.frames.as_ref(), points)?;
+        }
         let (first, frames) = (program.first(plan), self.frames.as_ref());
         match moving && program.one_time(plan) {
             true => init::one_time(&first, &recipe.initial(), frames, points),

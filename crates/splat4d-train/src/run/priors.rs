@@ -197,7 +197,7 @@ fn depths(opened: &OpenCapture) -> Result<Depths> {
 }
 
 fn is_metric(capture: &Capture, frame: usize) -> bool {
-    capture.frames[frame].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric)
+    capture.frames[frame].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric && d.fit.is_none())
 }
 
 /// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to
@@ -221,7 +221,7 @@ pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapt
     };
     let mut capture = Capture::clone(&opened.capture);
     for frame in &mut capture.frames {
-        if frame.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {
+        if frame.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric || d.fit.is_some()) {
             continue;
         }
         match (found, &mut frame.depth) {
@@ -269,7 +269,13 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
 }
 
 /// Renders a training frame with its depth.
-fn draw(scene: &Scene<f32>, opened: &OpenCapture, i: usize, renderer: &mut Renderer<f32>, out: &mut Image<f32>) {
+pub(super) fn draw(
+    scene: &Scene<f32>,
+    opened: &OpenCapture,
+    i: usize,
+    renderer: &mut Renderer<f32>,
+    out: &mut Image<f32>,
+) {
     let mut instant = Evaluation::default();
     scene.at(opened.frames.time(i), &mut instant);
     let splats = scene.splats(&instant);
@@ -278,6 +284,7 @@ fn draw(scene: &Scene<f32>, opened: &OpenCapture, i: usize, renderer: &mut Rende
 
 #[cfg(test)]
 mod tests {
+    use super::super::aligned::aligned;
     use super::*;
     use crate::capture::{CaptureOptions, PointCloud};
     use splat4d::format::npy;
@@ -364,5 +371,28 @@ mod tests {
         assert_eq!(believed(relative, &recipe).unwrap().1, None);
         let off = recipe.with(|r| r.loss.depth = 0.0);
         assert_eq!(believed(opened(folder.path(), "metric", &|x| depth(x) / 1.3), &off).unwrap().1, None);
+    }
+
+    #[test]
+    fn maps_without_a_unit_are_fitted_to_the_points() {
+        let (folder, recipe) = (tempfile::tempdir().unwrap(), Recipe::default());
+        let maps: [(&str, &dyn Fn(usize) -> f64); 2] =
+            [("inverse", &|x| 30.0 / depth(x) + 2.0), ("relative", &|x| 7.0 * depth(x) + 3.0)];
+        for (kind, map) in maps {
+            let (fitted, said) = aligned(opened(folder.path(), kind, map), &recipe).unwrap();
+            assert_eq!(said, None);
+            let mut picture = Picture::default();
+            fitted.frames.load(0, &mut picture).unwrap();
+            let map = picture.depth.unwrap();
+            assert_eq!(map.kind, DepthKind::Metric);
+            let off = |x: usize| (f64::from(map.values.get(0, 16, x)) / depth(x) - 1.0).abs();
+            assert!((0..SIDE).all(|x| off(x) < 0.01), "{kind}: {:?}", (0..SIDE).map(off).collect::<Vec<_>>());
+            // Nothing is fitted twice, or to a unit of its own.
+            assert_eq!(believed(fitted, &recipe).unwrap().1, None);
+        }
+        let (mirrored, said) =
+            aligned(opened(folder.path(), "inverse", &|x| 30.0 / depth(SIDE - 1 - x) + 2.0), &recipe).unwrap();
+        assert!(said.is_some_and(|s| s.contains("0 of 2 depth maps fit")));
+        assert!(mirrored.capture.frames.iter().all(|f| f.depth.as_ref().is_some_and(|d| d.kind == DepthKind::Inverse)));
     }
 }

@@ -7,6 +7,7 @@ use super::corrected;
 use super::identity::fingerprint;
 use super::info::{ELSEWHERE, elsewhere, read_info};
 use super::left::StepTimes;
+use super::measured;
 use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
 use super::open::OpenCapture;
@@ -353,6 +354,10 @@ impl Session<'_> {
             let mut bytes = Vec::new();
             splat4d::format::scene::write(&trainer.shown(), &mut bytes)?;
             write_atomically(&self.run.join("scene.safetensors"), &bytes)?;
+            if let Some((event, warning)) = measured::after(self.opened, &trainer.shown(), self.recipe, self.run)? {
+                listen(&event);
+                warning.into_iter().for_each(|message| listen(&Event::Warning { message }));
+            }
             for message in priors::after(self.opened, &trainer.shown(), self.recipe)? {
                 listen(&Event::Warning { message });
             }

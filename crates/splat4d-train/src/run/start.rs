@@ -1,11 +1,13 @@
 //! Starts runs, and continues them from their folders.
 
+use super::aligned::aligned;
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
 use super::count::settled;
 use super::flows;
 use super::identity::identity;
 use super::info::{read_info, read_text};
+use super::measured;
 use super::memory::memory_estimate;
 use super::minutes::Timing;
 use super::open::{OpenCapture, check_flow, open_capture};
@@ -49,13 +51,21 @@ pub fn train(
     let mut listen = listen;
     // Before the model is chosen by what maps indicate; again where points have to be found first.
     let (opened, early) = priors::believed(opened, &recipe)?;
-    let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
+    let recipe = if recipe.run.motion.is_auto() {
+        // Maps without a unit are fitted to all points, below; the capture's own determine whether they will be metric.
+        let (fitted, _) = aligned(OpenCapture::with(opened.frames.clone()).on(opened.device), &recipe)?;
+        fitted.choose(recipe, &mut listen)?
+    } else {
+        recipe
+    };
     recipe.program()?.check(&opened.plan(&recipe))?;
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let opened = points::complete(opened, &recipe, run, &mut listen)?;
     let opened = flows::complete(opened, &recipe, run, &mut listen)?;
+    measured::before(&opened)?;
+    let (opened, unfitted) = aligned(opened, &recipe)?;
     let (opened, warning) = priors::believed(opened, &recipe)?;
-    for message in priors::before(&opened, &recipe)?.into_iter().chain(early).chain(warning) {
+    for message in priors::before(&opened, &recipe)?.into_iter().chain(early).chain(unfitted).chain(warning) {
         listen(&Event::Warning { message });
     }
     let timed = timed(&opened, recipe, options, &mut listen)?;
@@ -215,6 +225,7 @@ pub fn resume_with(
     }
     let opened = OpenCapture::new(Arc::new(capture), &recipe)?.on(options.device);
     // As it was settled at the start.
+    let (opened, _) = aligned(opened, &recipe)?;
     let (opened, _) = priors::believed(opened, &recipe)?;
     let plan = opened.plan(&recipe);
     let empty = opened.scene(&recipe, &plan, recipe.program()?.as_ref(), &Seeds::default(), opened.background()?)?;

@@ -72,6 +72,7 @@ impl Batch {
                 mask: picture.mask.as_ref(),
                 weight: picture.weight.as_ref(),
                 depth: picture.depth.as_ref().map(Depth::truth),
+                measured: picture.measured(),
                 flow: picture.flow.as_ref().map(|f| FlowTruth { to: later(f), ..f.truth() }),
                 tracks: tracks.as_ref().map(|f| FlowTruth { to: later(f), ..f.truth() }),
                 frame: i,

@@ -184,6 +184,7 @@ mod tests {
             weight: None,
             depth: None,
             flow: None,
+            measured: None,
             tracks: None,
             frame: 0,
             rig: RIG,

@@ -3,6 +3,7 @@
 mod bed;
 mod depth;
 mod flow;
+mod geometry;
 #[cfg(feature = "gpu")]
 mod gpu;
 #[cfg(feature = "gpu")]

@@ -7,6 +7,7 @@ pub mod compare;
 pub mod compress;
 #[cfg(feature = "import")]
 pub mod doctor;
+mod measured;
 pub(crate) mod pictures;
 #[cfg(feature = "dynamics")]
 pub mod predict;
@@ -46,6 +47,7 @@ fn page(run: &Run) -> String {
     cards(&mut body, run);
     findings(&mut body, run);
     refined::section(&mut body, run);
+    measured::section(&mut body, run);
     compress::section(&mut body, run);
     film(&mut body, run);
     views(&mut body, run);

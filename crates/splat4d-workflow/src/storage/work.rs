@@ -191,8 +191,7 @@ impl Work<'_> {
         if is_done(&objects, part) {
             return Ok(false);
         }
-        let missing: Vec<String> = waits_for(chunked.as_ref(), part)
-            .into_iter()
+        let missing: Vec<String> = (chunked.iter().flat_map(|c| c.needs(part)))
             .filter(|p| !is_done(&objects, *p))
             .map(|p| format!("--chunk {p}"))
             .collect();
@@ -221,7 +220,7 @@ impl Work<'_> {
             }
             let mut busy = false;
             for part in open {
-                if waits_for(chunked.as_ref(), part).iter().any(|p| !is_done(&objects, *p)) {
+                if chunked.iter().flat_map(|c| c.needs(part)).any(|p| !is_done(&objects, p)) {
                     continue;
                 }
                 let Ok(claim) = self.claim(part)? else { continue };
@@ -282,7 +281,8 @@ impl Work<'_> {
         }
         let chunked = self.begun(&objects)?;
         let own = folder(part);
-        let (before, others) = (folder(Part::Shared), waits_for(chunked.as_ref(), part));
+        let before = folder(Part::Shared);
+        let others: Vec<Part> = chunked.iter().flat_map(|c| c.needs(part)).collect();
         let wanted = |name: &str| {
             let of_shared = name.starts_with(&before) && !name.contains("/capture/images/") && !name.contains("/calm/");
             let scene = |p: &Part| name == format!("{}scene.safetensors", folder(*p));
@@ -459,17 +459,6 @@ fn is_done(objects: &[Remote], part: Part) -> bool {
     let file = if part == Part::Shared { "still.safetensors" } else { "scene.safetensors" };
     let name = format!("{}{file}", folder(part));
     objects.iter().any(|o| o.name == name)
-}
-
-/// The parts whose results a part needs.
-fn waits_for(chunked: Option<&Chunked>, part: Part) -> Vec<Part> {
-    match (part, chunked) {
-        (Part::Chunk(c), Some(chunked)) => {
-            let neighbours = [c.wrapping_sub(1), c + 1].into_iter().filter(|n| c % 2 == 1 && *n < chunked.plan().len());
-            std::iter::once(Part::Shared).chain(neighbours.map(Part::Chunk)).collect()
-        }
-        _ => Vec::new(),
-    }
 }
 
 /// Joins the chunks of a run on a storage, measures and reports.

@@ -326,7 +326,7 @@ fn depth_maps_in_another_unit_are_named() {
         let map = ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| image::Luma([(1e3 * z(x, y)).round() as u16]));
         let path = folder.path().join(format!("{i}.png"));
         map.save(&path).unwrap();
-        capture.frames[i].depth = Some(DepthFile { path, scale: 1e-3, kind: DepthKind::Metric });
+        capture.frames[i].depth = Some(DepthFile { path, scale: 1e-3, kind: DepthKind::Metric, fit: None });
     }
     assert!(capture.check_points().is_empty(), "millimetres");
     for frame in &mut capture.frames {

@@ -58,7 +58,8 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCaptu
         let value = json::read(&camera)?;
         let source = camera_of(&Node::root(&value)).map_err(|e| e.at(camera.display()))?;
         let depth = folder.join("depth").join(format!("{stem}.png"));
-        let depth = depth.is_file().then_some(DepthFile { path: depth, scale: DEPTH_UNIT, kind: DepthKind::Metric });
+        let depth =
+            depth.is_file().then_some(DepthFile { path: depth, scale: DEPTH_UNIT, kind: DepthKind::Metric, fit: None });
         shots.push(Shot { name: name.clone(), image: images.join(&name), source, time: None, depth });
     }
     let (mut warnings, mut notes) = (doubled.into_iter().collect(), Vec::new());

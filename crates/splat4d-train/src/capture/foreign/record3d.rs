@@ -88,7 +88,8 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCaptu
         };
         let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem);
         let depth = root.join("depth").join(format!("{stem}.exr"));
-        let depth = depth.is_file().then_some(DepthFile { path: depth, scale: 1.0, kind: DepthKind::Metric });
+        let depth =
+            depth.is_file().then_some(DepthFile { path: depth, scale: 1.0, kind: DepthKind::Metric, fit: None });
         let source = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR };
         shots.push(Shot { name: name.clone(), image: folder.join(name), source, time: Some(time), depth });
     }

@@ -75,7 +75,7 @@ fn depth(top: &Node<'_>, node: &Node<'_>, path: PathBuf) -> Result<DepthFile> {
         let what = format!("{key} is {scale}");
         return Err(node.error(what).remedy("Give the scene units of a stored number, for instance 0.001"));
     }
-    Ok(DepthFile { path, scale, kind: DepthKind::Metric })
+    Ok(DepthFile { path, scale, kind: DepthKind::Metric, fit: None })
 }
 
 /// The name and camera of a frame whose image need not be there where the size is stated.

@@ -224,6 +224,7 @@ fn gradients_of_quantised_values_reach_the_parameters() {
             weight: None,
             depth: None,
             flow: None,
+            measured: None,
             tracks: None,
             frame: i,
             rig: 0,

@@ -32,6 +32,26 @@ impl<F: Real> ImageTerm<F> for Depth {
     }
 }
 
+/// [`depth`] of views that have measured geometry, with the same weight during the whole run: a scan is right where it
+/// has a surface, and errors of it are few and large, which the penalty bounds.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Measured(pub f64);
+
+impl<F: Real> ImageTerm<F> for Measured {
+    fn needs(&self, view: &View<'_, F>) -> Needs {
+        Needs { depth: view.measured.is_some(), extra: Vec::new() }
+    }
+
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
+        view.measured.is_some()
+    }
+
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
+        let Some(truth) = view.measured else { return 0.0 };
+        depth([shown.depth, shown.alpha], truth, self.0, [d.depth.add(), d.alpha.add()])
+    }
+}
+
 /// Errors below this cost their square: of a logarithm a hundredth of the distance; of standardised depth as much of
 /// its spread.
 const SOFT: f64 = 0.01;

@@ -30,7 +30,7 @@ pub(crate) const SEEN: f64 = 0.5;
 /// then what has a weight.
 pub(crate) fn terms(settings: &LossSettings) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
-    let weighted: [(f64, Make); 9] = [
+    let weighted: [(f64, Make); 10] = [
         (settings.tv, |w| Box::new(tv::TotalVariation(w))),
         (settings.frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
         (settings.mask, |w| Box::new(mask::Mask(w))),
@@ -38,6 +38,7 @@ pub(crate) fn terms(settings: &LossSettings) -> Vec<Box<dyn ImageTerm>> {
         (settings.depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
         (settings.depth_normal, |w| Box::new(normal::DepthNormal(w))),
         (settings.depth, |w| Box::new(depth::Depth(w))),
+        (settings.geometry, |w| Box::new(depth::Measured(w))),
         (settings.flow, |w| Box::new(flow::Flow(w))),
         (settings.tracks, |w| Box::new(flow::Tracks(w))),
     ];

@@ -38,6 +38,8 @@ pub struct View<'a, F = f32> {
     pub weight: Option<&'a Planes<F>>,
     /// Its depth, where known.
     pub depth: Option<DepthTruth<'a, F>>,
+    /// Depth of measured geometry, where known.
+    pub measured: Option<DepthTruth<'a, F>>,
     /// Its optical flow, where known.
     pub flow: Option<FlowTruth<'a, F>>,
     /// Positions of tracked points at another time: flow that is known in their pixels alone.

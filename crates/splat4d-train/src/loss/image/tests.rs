@@ -33,6 +33,7 @@ where
         weight: None,
         depth: None,
         flow: None,
+        measured: None,
         tracks: None,
         frame: 0,
         rig: 0,

@@ -50,6 +50,7 @@ fn run(scene: &Scene<f64>, needs: &Needs, backend: &mut dyn Backend<f64>) -> (f6
             mask: None,
             weight: None,
             depth: None,
+            measured: None,
             flow: Some(FlowTruth {
                 to: Time(if i == 0 { 0.1 } else { 0.15 }),
                 camera: &shots[1 - i].camera,

@@ -193,6 +193,7 @@ fn step(
             weight: None,
             depth: None,
             flow: None,
+            measured: None,
             tracks: None,
             frame: 0,
             rig: 0,

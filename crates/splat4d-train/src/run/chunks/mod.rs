@@ -208,22 +208,21 @@ impl Chunked {
         self.folder(part).join(file).is_file()
     }
 
+    /// The parts whose results this one begins with: the shared layer, and for an odd chunk its neighbours.
+    pub fn needs(&self, part: Part) -> Vec<Part> {
+        let Part::Chunk(c) = part else { return Vec::new() };
+        std::iter::once(Part::Shared).chain(self.neighbours(c).map(Part::Chunk)).collect()
+    }
+
     /// The parts that must be there before this one begins, of those that are not.
-    pub fn waits_for(&self, part: Part) -> Vec<Part> {
-        let needs = match part {
-            Part::Shared => Vec::new(),
-            Part::Chunk(c) => std::iter::once(Part::Shared).chain(self.neighbours(c).map(Part::Chunk)).collect(),
-        };
-        needs.into_iter().filter(|p| !self.is_done(*p)).collect()
+    fn missing(&self, part: Part) -> Vec<Part> {
+        self.needs(part).into_iter().filter(|p| !self.is_done(*p)).collect()
     }
 
     /// The chunks that chunk c starts from.
     fn neighbours(&self, c: usize) -> impl Iterator<Item = usize> {
-        let odd = c % 2 == 1;
-        [c.wrapping_sub(1), c + 1].into_iter().filter(move |n| odd && *n < usize::MAX).filter({
-            let count = self.plan.len();
-            move |n| *n < count
-        })
+        let count = self.plan.len();
+        [c.wrapping_sub(1), c + 1].into_iter().filter(move |n| c % 2 == 1 && *n < count)
     }
 
     /// Trains one part, unless it is done. Errors: parts before it are missing, another worker has it, and those of
@@ -245,7 +244,7 @@ impl Chunked {
         if self.is_done(part) {
             return Ok(None);
         }
-        let missing = self.waits_for(part);
+        let missing = self.missing(part);
         if !missing.is_empty() {
             let names: Vec<String> = missing.iter().map(|p| format!("--chunk {p}")).collect();
             return Err(Error::input(format!("chunk {part} begins where others end that are not finished"))
@@ -300,7 +299,7 @@ impl Chunked {
                 return Ok(None);
             }
             let mut busy = false;
-            for part in open.into_iter().filter(|p| self.waits_for(*p).is_empty()) {
+            for part in open.into_iter().filter(|p| self.missing(*p).is_empty()) {
                 let Ok(owner) = Owner::take(&self.folder(part), MADE_BY)? else { continue };
                 busy = true;
                 let outcome = self.claimed(part, options, stop, &mut listen)?;

@@ -164,7 +164,7 @@ fn of_medians(recipe: &Recipe) -> Recipe {
         r.capture.downscale = 1;
         r.capture.hold_out = Some(HoldOut::None);
         (r.capture.first_frame, r.capture.max_frames, r.capture.fps) = (0, 0, 0.0);
-        (r.loss.depth, r.loss.flow, r.loss.tracks) = (0.0, 0.0, 0.0);
+        (r.loss.depth, r.loss.geometry, r.loss.flow, r.loss.tracks) = (0.0, 0.0, 0.0, 0.0);
         // Medians have no shutter and no time.
         (r.capture.rolling_shutter, r.capture.subframes, r.appearance.exposure_knots) = (false, 1, 1);
         r.life.kind = None;

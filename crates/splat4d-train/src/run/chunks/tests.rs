@@ -165,6 +165,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
             weight: None,
             depth: None,
             flow: None,
+            measured: None,
             tracks: None,
             frame: 0,
             rig: 0,

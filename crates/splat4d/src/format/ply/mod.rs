@@ -88,6 +88,8 @@ pub struct PlyPoints {
     pub colors: Vec<[f32; 3]>,
     /// Seconds at which each point was seen (`time` or `t`); empty where the file does not state them.
     pub times: Vec<f64>,
+    /// Triangles between the points, by their numbers; faces with more corners are fans. Empty in a cloud.
+    pub triangles: Vec<[u32; 3]>,
 }
 
 /// Reads Gaussians: any order and type of properties, binary of either byte order or text, any other elements.
@@ -182,10 +184,10 @@ pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
     Header::read(bytes).is_ok_and(|h| h.elements.iter().any(packed))
 }
 
-/// Reads the positions of any PLY file, the times of its points, and their colours: `red green blue`, `r g b`, or the
-/// base colour of Gaussians.
+/// Reads the positions of any PLY file, the times of its points, their colours (`red green blue`, `r g b`, or the base
+/// colour of Gaussians), and the faces of a mesh.
 ///
-/// Errors: not a PLY file, truncated, or without positions.
+/// Errors: not a PLY file, truncated, without positions, or with a face between points that are not there.
 pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
     let header = Header::read(bytes)?;
     let Some(vertex) = header.elements.iter().find(|e| e.name == "vertex") else {
@@ -212,7 +214,8 @@ pub fn read_points(bytes: &[u8]) -> Result<PlyPoints> {
     };
     let time = vertex.find("time").or(vertex.find("t"));
     let times = time.map_or(Vec::new(), |c| (0..rows.len()).map(|row| rows.get(row, c)).collect());
-    Ok(PlyPoints { positions, colors, times })
+    let triangles = rows::triangles(&header, bytes, rows.len())?;
+    Ok(PlyPoints { positions, colors, times, triangles })
 }
 
 /// Writes Gaussians in the plain layout, little-endian; normals are zero and other tables are left out.

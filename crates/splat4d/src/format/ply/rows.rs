@@ -84,6 +84,63 @@ pub(super) fn find<'a, const N: usize>(
     Ok(out)
 }
 
+/// Names of the element of faces, and of its list of corners.
+const FACE: &str = "face";
+const CORNERS: [&str; 2] = ["vertex_indices", "vertex_index"];
+
+/// The triangles of a mesh of `vertices` points; none in a file without faces.
+///
+/// Errors: truncated; a corner that is not one of the points.
+pub(super) fn triangles(header: &Header, bytes: &[u8], vertices: usize) -> Result<Vec<[u32; 3]>> {
+    let is_list = |k: &Kind| matches!(k, Kind::List(..));
+    let has_corners = |e: &Element| e.properties.iter().any(|p| CORNERS.contains(&p.name.as_str()) && is_list(&p.kind));
+    let Some(at) = header.elements.iter().position(|e| e.name == FACE && has_corners(e)) else {
+        return Ok(Vec::new());
+    };
+    let mut rest = &bytes[header.body..];
+    for element in &header.elements[..at] {
+        element_rows(element, header.encoding, &mut rest, false)
+            .map_err(|e| e.at(format_args!("element `{}`", element.name)))?;
+    }
+    let (face, big) = (&header.elements[at], header.encoding == Encoding::Big);
+    let mut out = Vec::new();
+    let mut corners: Vec<u32> = Vec::new();
+    for row in 0..face.count {
+        let place = |e: crate::Error| e.at(format_args!("element `{FACE}`: row {row}"));
+        let mut next = |scalar| match header.encoding {
+            Encoding::Ascii => word(&mut rest),
+            _ => number(scalar, big, &mut rest),
+        };
+        for property in &face.properties {
+            let Kind::List(length, item) = property.kind else {
+                let Kind::Scalar(scalar) = property.kind else { unreachable!("a property is a number or a list") };
+                next(scalar).map_err(place)?;
+                continue;
+            };
+            let length = next(length).map_err(place)?;
+            if !(length >= 0.0 && length.fract() == 0.0) {
+                return Err(place(broken(format!("a list has the length {length}"))));
+            }
+            let wanted = CORNERS.contains(&property.name.as_str());
+            corners.clear();
+            // Every item takes bytes or ends the file, so that a false length cannot keep us here.
+            for _ in 0..length as u64 {
+                let corner = next(item).map_err(place)?;
+                if !wanted {
+                    continue;
+                }
+                if !(corner >= 0.0 && corner < vertices as f64) {
+                    let what = format!("a face has the corner {corner}, and there are {vertices} points");
+                    return Err(place(broken(what)));
+                }
+                corners.push(corner as u32);
+            }
+            out.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
+        }
+    }
+    Ok(out)
+}
+
 /// The rows of the element at the front of `rest`, which is moved behind them; a `Wide` body is empty unless `keep`.
 fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], keep: bool) -> Result<Rows<'a>> {
     let count = element.count;
