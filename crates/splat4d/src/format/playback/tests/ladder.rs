@@ -127,11 +127,11 @@ fn windows_last_a_second_or_more_and_lose_no_byte() {
 fn damaged_ladders_are_refused_and_changed_pages_state_none() {
     let (bytes, index) = laddered(&long(3000), &[1.0, 2.0]);
     for ladder in [
-        vec![Rung { rate: 2e6, tiers: 1 }, Rung { rate: 1e6, tiers: 2 }],
-        vec![Rung { rate: 1e6, tiers: 2 }, Rung { rate: 2e6, tiers: 2 }],
-        vec![Rung { rate: 0.0, tiers: 1 }],
-        vec![Rung { rate: f64::NAN, tiers: 1 }],
-        (1..20).map(|k| Rung { rate: f64::from(k), tiers: k }).collect(),
+        vec![Rung { rate: 2e6, tiers: 1, ..Rung::default() }, Rung { rate: 1e6, tiers: 2, ..Rung::default() }],
+        vec![Rung { rate: 1e6, tiers: 2, ..Rung::default() }, Rung { rate: 2e6, tiers: 2, ..Rung::default() }],
+        vec![Rung { rate: 0.0, tiers: 1, ..Rung::default() }],
+        vec![Rung { rate: f64::NAN, tiers: 1, ..Rung::default() }],
+        (1..20).map(|k| Rung { rate: f64::from(k), tiers: k, ..Rung::default() }).collect(),
     ] {
         assert!(Meta { ladder, ..index.meta.clone() }.check().is_err());
     }
