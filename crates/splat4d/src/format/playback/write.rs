@@ -271,6 +271,7 @@ impl PageEntry {
 /// Panics: a node has more than 4 billion Gaussians.
 pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
     config.depths.check()?;
+    draft.meta.check()?;
     draft
         .nodes
         .iter()
