@@ -114,9 +114,3 @@ export class Timer {
     this.#open = false;
   }
 }
-
-/// Whether WebGL states that it is computed on the CPU.
-export function software(gl) {
-  const asked = gl?.getExtension?.('WEBGL_debug_renderer_info');
-  return !!asked && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(asked.UNMASKED_RENDERER_WEBGL));
-}

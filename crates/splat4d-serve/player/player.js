@@ -4,9 +4,8 @@
 import { Camera, NEAR, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
 import { SPEED_RANGE, STEP_MAX } from './constants.js';
 import { Controls } from './controls.js';
-import { Cost, Pace } from './pace.js';
+import { Cost, Pace, software } from './pace.js';
 import { SceneError, cutShort } from './errors.js';
-import { software } from './gl.js';
 import { Ladder, rungOf } from './ladder.js';
 import { SceneFile } from './scene-file.js';
 import { advance } from './schedule.js';

@@ -19,6 +19,8 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
+/// Bytes 8 and 9 of a file that grows: its major version (docs/format.md, "Files that grow").
+const GROWS: [u8; 2] = [2, 0];
 /// Name of the file that is made of the parts of a capture whose file is finished already.
 const AGAIN: &str = ".scene.again.s4d";
 
@@ -88,7 +90,7 @@ fn grows(path: &Path) -> Result<bool> {
     let mut header = Vec::new();
     let file = files::open(path)?;
     file.take(HEADER_BYTES as u64).read_to_end(&mut header).map_err(|e| cannot_read(path, e))?;
-    Ok(Index::place(&header).is_err() || Index::grows(&header))
+    Ok(Index::place(&header).is_err() || header[8..10] == GROWS)
 }
 
 /// Appends what is missing, in time; `thorough`: and checks that its parts match the existing chunks.

@@ -14,7 +14,7 @@ Examples:
   splat4d bake runs/knight -o small.s4d --size 4MB    motion is split as finely as that allows
   splat4d bake runs/knight -o tight.s4d --tolerance 0.1
   splat4d bake runs/knight -o long.s4d --repeat 20    repeat the clip twenty times
-  splat4d bake runs/dance -o dance.s4d --ladder 8,20,75  the player chooses by the connection and the device
+  splat4d bake runs/knight -o steps.s4d --ladder 1,2,4   the player chooses by the connection
 
 `train` does this at its end: the file is RUN/scene.s4d.";
 

@@ -62,19 +62,17 @@ pub(crate) fn rungs(index: &Index) -> Vec<RungReport> {
     let before: u64 = pages.iter().map(|e| e.offset).min().unwrap_or(0);
     let report = |rung: &splat4d::format::playback::Rung| {
         let own = || pages.iter().filter(|e| e.tier < rung.tiers);
-        let loads = index.bits_per_second(rung.tiers);
-        let mean = loads.iter().sum::<f64>() / loads.len().max(1) as f64;
         let at_once = own().map(|e| f64::from(e.count) * (e.span[1] - e.span[0])).sum::<f64>() / seconds;
         let first = own().filter(|e| e.tier == 0 && e.span[0] <= start && start < e.span[1]);
         let first_image_bytes = before + first.map(|e| u64::from(e.stored)).sum::<u64>();
         RungReport {
             rate: rung.rate / MEGA,
             tiers: rung.tiers,
-            most: loads.iter().copied().fold(0.0, f64::max) / MEGA,
-            mean: mean / MEGA,
+            most: rung.most / MEGA,
+            mean: rung.mean / MEGA,
             gaussians: own().map(|e| e.count as usize).sum(),
             at_once,
-            bits_a_gaussian: mean / at_once.max(1.0),
+            bits_a_gaussian: rung.mean / at_once.max(1.0),
             bytes: own().map(|e| u64::from(e.stored)).sum(),
             first_image_bytes,
             first_image_seconds: 8.0 * first_image_bytes as f64 / rung.rate,

@@ -56,7 +56,10 @@ impl Line {
         let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
         let shown = [seen[0].max(from), seen[1].min(to)];
         let pixels = sampling.pixels(at(0.5 * (shown[0] + shown[1])));
-        let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
+        // A clip of one time has no length to be visible for a share of.
+        let [first, last] = tree.clip();
+        let share = if first < last { ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0) } else { 1.0 };
+        let area = pixels * pixels * share;
         let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
         Some(Piece { span: node, primitive, error: 0.0 })
     }

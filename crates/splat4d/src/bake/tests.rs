@@ -312,6 +312,13 @@ fn colours_that_change_are_followed() {
 }
 
 #[test]
+fn gaussians_of_a_static_scene_have_an_importance() {
+    let single = scene(vec![layer(&spacetime(1, false), LifeKind::Infinite, 30, 0.3, 0.0)], 0.0);
+    let one = baked(&single, &options(0.25));
+    assert!(one.nodes[0].primitives.iter().all(|p| p.importance > 0.0), "without one, tiers are in the order of rows");
+}
+
+#[test]
 fn odd_scenes_bake_or_are_refused() {
     let empty = scene(Vec::new(), 1.0);
     assert!(baked(&empty, &options(0.25)).nodes.is_empty());

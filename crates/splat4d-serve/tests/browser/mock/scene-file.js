@@ -8,6 +8,8 @@ const wait = ms => new Promise(done => setTimeout(done, ms));
 const PAGES = 6, COUNT = 400;
 
 export class SceneFile {
+  rate() { return Infinity; }
+
   static async open(source, { signal } = {}) {
     const name = typeof source === 'string' ? source : source.name ?? 'bytes';
     globalThis.mockOpened = [...(globalThis.mockOpened ?? []), name];

@@ -18,6 +18,18 @@ export class Stream {
   }
   ready(time) { return this.file.activePages(time).every(p => this.#here.has(p.id)) ? 1 : 0; }
   playable(time) { return this.ready(time) === 1; }
+  buffered(points) {
+    const [first, last] = this.file.meta.clip, out = [];
+    for (let i = 0; i < points; i++) {
+      const [a, b] = [i / points, (i + 1) / points];
+      if (!this.playable(first + (a + b) / 2 * (last - first))) continue;
+      if (out.at(-1)?.[1] === a) out.at(-1)[1] = b;
+      else out.push([a, b]);
+    }
+    return out;
+  }
+  shown() { return { rung: 0, left: 0 }; }
+  rungs() { return null; }
   async settled(time) { while (!this.ready(time)) await new Promise(done => setTimeout(done, 10)); }
   destroy() {}
 }

@@ -168,7 +168,7 @@ impl Index {
     }
 
     /// Whether a file's first bytes mark its clip as unfinished.
-    pub fn grows(header: &[u8]) -> bool {
+    pub(super) fn grows(header: &[u8]) -> bool {
         header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
     }
 
@@ -218,8 +218,9 @@ impl Index {
             .enumerate()
             .map(|(i, bytes)| Entry::parse(bytes).map_err(|e| e.at(format!("section {i}"))))
             .collect::<Result<_>>()?;
-        let index = Self { version: header.version, file_len: header.file_len, meta, sections };
+        let mut index = Self { version: header.version, file_len: header.file_len, meta, sections };
         index.check(place)?;
+        index.measure_rungs();
         Ok(index)
     }
 

@@ -5,13 +5,13 @@
 //! exceeds the price of its bytes there. Prices rise in windows that are over the rate and fall in others. What a page
 //! really takes is known only after it is deflated, so that the writer repeats the choice with what it measured.
 
-use super::write::FIRST_GAUSSIANS;
-use super::{Draft, Index, Kind, MAX_PAGE_GAUSSIANS};
+use super::rungs::check;
+use super::{Draft, Index, Kind, MAX_PAGE_GAUSSIANS, Rung};
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
 
-/// Most rungs that a file may state.
-const MOST_RUNGS: usize = 9;
+/// Most Gaussians in the first tiers of one time, so that a coarse image needs less than 1 MB: a Gaussian has 18 to 24
+/// bytes, and index and poster take some of it.
+pub(super) const FIRST_GAUSSIANS: f64 = 32_000.0;
 /// Most windows of a clip, about three hours: longer clips have longer windows.
 const MOST_WINDOWS: usize = 10_000;
 /// Bytes of a Gaussian before any was deflated.
@@ -35,32 +35,6 @@ const FULL: f64 = 0.97;
 const UNKNOWN: f64 = 1000.0;
 /// The next choice aims at this share of the rate.
 const AIM: f64 = 0.99;
-
-/// A rung of a bitrate ladder: the pages with a tier below `tiers`, and the rate that suffices for them.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Rung {
-    /// Bits per second; no window of the clip needs more.
-    pub rate: f64,
-    /// Pages with a lower tier belong to it.
-    pub tiers: u16,
-}
-
-/// Whether rates and tiers of a file's rungs rise.
-pub(super) fn is_ladder(rungs: &[Rung]) -> bool {
-    let rising = |pair: &[Rung]| pair[0].rate < pair[1].rate && pair[0].tiers < pair[1].tiers;
-    let sound = |r: &Rung| r.rate.is_finite() && r.rate > 0.0 && r.tiers > 0;
-    rungs.len() <= MOST_RUNGS && rungs.iter().all(sound) && rungs.windows(2).all(rising)
-}
-
-/// Errors: rates that do not rise from above zero, or too many.
-pub(super) fn check(rates: &[f64]) -> Result<()> {
-    let rungs: Vec<Rung> = rates.iter().zip(1..).map(|(&rate, tiers)| Rung { rate, tiers }).collect();
-    if is_ladder(&rungs) && rates.len() < MOST_RUNGS {
-        return Ok(());
-    }
-    Err(Error::input(format!("invalid ladder: expected at most {} rising rates", MOST_RUNGS - 1))
-        .remedy("Give the rates in Mbit/s, the lowest first, for example 8,20,75"))
-}
 
 /// Equal windows of at least a second over which rates are averaged; a shorter clip is one window of a second.
 #[derive(Clone, Copy, Debug)]
@@ -129,7 +103,7 @@ impl Spread {
 impl Index {
     /// Bits per second of the pages with a tier below `tiers` and of what every player loads with them (index, poster,
     /// palettes, sound), in each window. A page counts evenly over its span, everything else evenly over the clip.
-    pub fn bits_per_second(&self, tiers: u16) -> Vec<f64> {
+    pub(super) fn bits_per_second(&self, tiers: u16) -> Vec<f64> {
         let windows = Windows::of(self.pages().map(|(_, e)| e.span));
         let mut spread = Spread::new(&windows);
         let mut beside = self.file_len.saturating_sub(self.sections.iter().map(|e| u64::from(e.stored)).sum()) as f64;
@@ -150,9 +124,19 @@ impl Index {
         let each = beside / windows.count as f64;
         spread.sums().into_iter().map(|bytes| 8.0 * (bytes + each) / windows.seconds).collect()
     }
+
+    /// Measures the rungs that the file states.
+    pub(super) fn measure_rungs(&mut self) {
+        for k in 0..self.meta.ladder.len() {
+            let loads = self.bits_per_second(self.meta.ladder[k].tiers);
+            let rung = &mut self.meta.ladder[k];
+            rung.most = loads.iter().copied().fold(0.0, f64::max);
+            rung.mean = loads.iter().sum::<f64>() / loads.len().max(1) as f64;
+        }
+    }
 }
 
-/// Most entries of a palette whose entries have so many bytes, at the lowest of these rates.
+/// Most entries of a palette at the lowest of these rates; an entry has `bytes`.
 pub(super) fn palette_entries(draft: &Draft, rates: &[f64], bytes: usize) -> usize {
     let Some(rate) = rates.first() else { return usize::MAX };
     let windows = Windows::of(draft.nodes.iter().map(|n| [n.from, n.to]));
@@ -258,7 +242,7 @@ impl Ladder {
             }
             below = below.saturating_add(most.max(1) as u16);
             let unknown = UNKNOWN * self.rates[self.rates.len() - 1];
-            rungs.push(Rung { rate: self.rates.get(k).copied().unwrap_or(unknown), tiers: below });
+            rungs.push(Rung { rate: self.rates.get(k).copied().unwrap_or(unknown), tiers: below, ..Rung::default() });
         }
         self.counts = counts;
         (tiers, rungs)
@@ -312,7 +296,7 @@ impl Ladder {
         self.round >= ROUNDS
     }
 
-    /// Gaussians of every node within so many bytes in each window, at least those that the rung before has.
+    /// Gaussians of every node within `bytes` in each window, at least those that the rung before has.
     fn choose(&self, bytes: f64, before: &[usize], all: &[usize]) -> Vec<usize> {
         let fits = |counts: &[usize]| self.load(counts).into_iter().all(|b| b <= bytes);
         if fits(all) {
@@ -397,7 +381,7 @@ pub(super) fn stated(index: &Index, later: u64, rungs: &[Rung], given: usize) ->
             out.truncate(k + 1);
             out[k].tiers = last.tiers;
         }
-        None => out.push(Rung { rate: whole, tiers: last.tiers }),
+        None => out.push(Rung { rate: whole, tiers: last.tiers, ..Rung::default() }),
     }
     out
 }

@@ -1,6 +1,6 @@
 //! The JSON of a playback file.
 
-use super::{Rung, ladder};
+use super::rungs::{Rung, is_ladder};
 use crate::layers::{Head, Layer, Scene};
 use crate::math::Se3;
 use crate::scene::features::MOST_CHANNELS;
@@ -200,7 +200,7 @@ impl Meta {
         if self.bounds.is_some_and(|b| !finite(b.as_flattened())) {
             return wrong("`box` is not finite");
         }
-        if !ladder::is_ladder(&self.ladder) {
+        if !is_ladder(&self.ladder) {
             return wrong("`ladder` is not a list of rungs with rising rates and tiers");
         }
         let sound = |[low, high]: &[f32; 2]| low.is_finite() && high.is_finite() && low <= high;

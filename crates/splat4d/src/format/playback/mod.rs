@@ -23,6 +23,7 @@ mod pages;
 mod palette;
 mod provenance;
 mod read;
+mod rungs;
 mod sound;
 mod strict;
 #[cfg(test)]
@@ -36,7 +37,6 @@ pub(crate) use features::of_layer as features_of;
 pub use grow::{Growing, finish};
 pub use index::{Codec, Entry, Index, Kind};
 pub(crate) use labels::of_layer as labels_of;
-pub use ladder::Rung;
 pub(crate) use layer::{as_layers, is_page, primitives};
 pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
@@ -48,6 +48,7 @@ pub(crate) use palette::decode_palette;
 use provenance::with_provenance;
 pub use provenance::{Provenance, provenance};
 pub use read::read;
+pub use rungs::Rung;
 #[cfg(test)]
 use sound::with_sound;
 pub use sound::{Sound, sound, with_extras};

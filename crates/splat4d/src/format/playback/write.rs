@@ -4,7 +4,7 @@ use super::block::encode_page;
 use super::cluster::cluster;
 use super::deflate::deflate;
 use super::index::{MASK_HEAD, crc, mask_keys};
-use super::ladder::{Ladder, Next, Tier};
+use super::ladder::{FIRST_GAUSSIANS, Ladder, Next, Tier};
 use super::page::parse_page;
 use super::{
     BLOCK_GAUSSIANS, BLOCK_HEADER, Codec, Depths, Draft, Entry, FIRST_VERSION, Index, Kind, MAX_PAGE_GAUSSIANS,
@@ -23,9 +23,6 @@ const SMALL_PALETTE: usize = 256;
 /// many show the bundled scene at 28 dB, its dynamic regions at 29 dB; a quarter shows it at 22 and 23 dB.
 const FIRST_TIER: f64 = 0.4;
 const SMALLEST_TIER: usize = 4096;
-/// Most Gaussians in the first tiers of one time, so that a coarse image needs less than 1 MB: a Gaussian has 18 to 24
-/// bytes, and index and poster take some of it.
-pub(super) const FIRST_GAUSSIANS: f64 = 32_000.0;
 /// The program that writes, as files name it.
 pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
@@ -274,6 +271,7 @@ impl PageEntry {
 /// Panics: a node has more than 4 billion Gaussians.
 pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result<Summary> {
     config.depths.check()?;
+    draft.meta.check()?;
     draft
         .nodes
         .iter()
@@ -426,7 +424,7 @@ fn check(node: &Node, meta: &Meta) -> Result<()> {
     Ok(())
 }
 
-/// Gaussians of the first tier of so many.
+/// Gaussians of the first tier of `rows`.
 fn first_tier(rows: usize, config: &WriteConfig) -> usize {
     let share = ((rows as f64 * FIRST_TIER) as usize).max(SMALLEST_TIER);
     let first = if config.tier > 0 { config.tier } else { share }.min(MAX_PAGE_GAUSSIANS);
