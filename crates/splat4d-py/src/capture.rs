@@ -120,12 +120,12 @@ impl Capture {
     }
 
     /// Runs networks, `{"depth": "d.onnx"}` (docs/networks.md), and returns figures. A capture that is opened later has the results.
-    #[pyo3(signature = (networks, described=BTreeMap::new(), force=false))]
+    #[pyo3(signature = (networks, described=None, force=false))]
     fn priors(
         &self,
         py: Python<'_>,
         networks: BTreeMap<String, PathBuf>,
-        described: BTreeMap<String, String>,
+        described: Option<BTreeMap<String, String>>,
         force: bool,
     ) -> PyResult<Py<PyAny>> {
         let part = |word: &str| {
@@ -135,7 +135,11 @@ impl Capture {
             })
         };
         let networks = networks.into_iter().map(|(word, path)| Ok((part(&word)?, path))).collect::<PyResult<_>>()?;
-        let described = described.into_iter().map(|(word, name)| Ok((part(&word)?, name))).collect::<PyResult<_>>()?;
+        let described = described
+            .unwrap_or_default()
+            .into_iter()
+            .map(|(word, name)| Ok((part(&word)?, name)))
+            .collect::<PyResult<_>>()?;
         let request = Priors { capture: self.path.clone(), networks, described, force };
         let (made, _) = workflows::run(py, |listener, stop| priors::priors(&request, stop, listener))?;
         plain(py, &made.json())

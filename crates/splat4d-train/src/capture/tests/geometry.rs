@@ -63,7 +63,9 @@ fn a_scan_gives_points_and_the_depth_of_training_images() {
     let capture = open(&sample);
     let own_points = plain.points.as_ref().unwrap().points.len();
     let cloud = capture.points.as_ref().unwrap();
-    assert!(cloud.points.len() > own_points + 500 && cloud.colors.iter().any(|c| (c[1] - 0.4).abs() < 1e-6 && c[0] != 0.5));
+    assert!(
+        cloud.points.len() > own_points + 500 && cloud.colors.iter().any(|c| (c[1] - 0.4).abs() < 1e-6 && c[0] != 0.5)
+    );
     assert!(capture.notes.iter().any(|n| n.contains("scan.ply") && n.contains("4000 points")), "{:?}", capture.notes);
     for k in 0..2 {
         let (share, worst) = against_floor(&capture, k);
