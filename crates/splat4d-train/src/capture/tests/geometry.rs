@@ -146,7 +146,7 @@ fn what_is_wrong_with_a_scan_is_an_error_that_names_it() {
     assert!(text.contains("transform") && text.contains("scan.ply") && text.contains("5000.0000"), "{text}");
     sample.write("scan.ply", b"LASF");
     assert!(error(&sample).contains("LAS header"), "{}", error(&sample));
-    with(&sample, json!({"files": "scan.ply", "tranform": []}));
+    with(&sample, json!({"files": "scan.ply", "transforms": []}));
     assert!(error(&sample).contains("Did you mean \"transform\""), "{}", error(&sample));
     let flat = json!([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
     with(&sample, json!({"files": "scan.ply", "transform": flat}));
