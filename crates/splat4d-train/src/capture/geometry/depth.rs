@@ -143,7 +143,7 @@ impl SeenDisc {
                 let ray = [(px as f32 + 0.5 - cx) / fx, (py as f32 + 0.5 - cy) / fy];
                 let slope = n[0] * ray[0] + n[1] * ray[1] + n[2];
                 let depth = along / slope;
-                if !(depth > 0.0) || !depth.is_finite() {
+                if !depth.is_finite() || depth <= 0.0 {
                     continue;
                 }
                 let off = [depth * ray[0] - x, depth * ray[1] - y, depth - z];

@@ -60,7 +60,8 @@ fn obj(bytes: &[u8]) -> Result<Surface> {
         match words.next() {
             Some("v") => {
                 let values: Vec<f64> = words.map_while(|w| w.parse().ok()).collect();
-                if values.len() < 3 || values[..3].iter().any(|v| !(v.abs() <= crate::capture::pose::FARTHEST)) {
+                let near = |v: &f64| v.abs() <= crate::capture::pose::FARTHEST;
+                if values.len() < 3 || !values[..3].iter().all(near) {
                     return Err(wrong(format!("expected three finite coordinates, found `{line:.60}`")));
                 }
                 out.points.push([values[0], values[1], values[2]]);
