@@ -269,16 +269,19 @@ fn at<const X: i32, const Y: i32, const Z: i32>(_: f64) -> V3 {
     [X, Y, Z].map(|v| 0.1 * f64::from(v))
 }
 
+/// Where something is at a share of the capture.
+type Place = fn(f64) -> V3;
+
 /// A street: a railing close to the walker, stairs, houses on both sides, two round trees, a far horizon.
 fn street() -> World {
     let part = |half: V3, seed: u64, grain: f64| move |place| thing(Shape::Crate(half), place, texture(seed, grain));
     let posts = [at::<9, 5, -100>, at::<9, 5, -60>, at::<9, 5, -20>, at::<9, 5, 20>, at::<9, 5, 60>, at::<9, 5, 100>];
     let bars = [at::<9, 10, 0>, at::<9, 6, 0>];
     let houses = [at::<60, 30, -80>, at::<-70, 30, -70>, at::<65, 30, 40>, at::<-60, 30, 60>, at::<10, 30, -180>];
-    let steps: [(fn(f64) -> V3, f64); 4] =
+    let steps: [(Place, f64); 4] =
         [(at::<-22, 1, -20>, 0.1), (at::<-22, 2, -26>, 0.2), (at::<-22, 3, -32>, 0.3), (at::<-22, 4, -38>, 0.4)];
     let trunks = [at::<-25, 8, 30>, at::<25, 8, -40>];
-    let crowns: [fn(f64) -> V3; 2] = [at::<-25, 20, 30>, at::<25, 20, -40>];
+    let crowns: [Place; 2] = [at::<-25, 20, 30>, at::<25, 20, -40>];
     let things = [floor(40.0), dome(FAR * RADIUS)].into_iter();
     let things = things.chain(posts.map(part([0.03, 0.5, 0.03], 2, 0.1)));
     let things = things.chain(bars.map(part([0.02, 0.02, 11.0], 8, 0.2)));

@@ -269,9 +269,9 @@ impl Description {
         }
         let letters: Vec<char> = output.layout.chars().collect();
         let unique = (1..letters.len()).all(|i| !letters[..i].contains(&letters[i]));
-        if !letters.is_empty() && !(unique && letters.iter().all(|c| "nchw".contains(*c)))
-            || !letters.is_empty() && !(letters.contains(&'h') && letters.contains(&'w'))
-        {
+        let known = letters.iter().all(|c| "nchw".contains(*c));
+        let whole = unique && known && letters.contains(&'h') && letters.contains(&'w');
+        if !letters.is_empty() && !whole {
             return bad(format!(
                 "expected output.layout of the letters n, c, h and w, such as \"nchw\" or \"hw\", found \"{:.30}\"",
                 output.layout
