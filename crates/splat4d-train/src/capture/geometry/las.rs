@@ -62,7 +62,9 @@ pub(super) fn read(bytes: &[u8]) -> Result<Surface> {
             "the header claims {count} points of {length} bytes from byte {start} on, and {there} bytes follow"
         )));
     }
-    let records = || bytes[start as usize..].chunks_exact(length).take(count as usize);
+    // A file without points may claim to begin behind its end.
+    let first = start.min(bytes.len() as u64) as usize;
+    let records = || bytes[first..].chunks_exact(length).take(count as usize);
     let rgb = |record: &[u8], at: usize| [0, 2, 4].map(|k| little(&record[at + k..at + k + 2]) as f32);
     // Some programs write colours of 8 bits as they are.
     let white = match color {
