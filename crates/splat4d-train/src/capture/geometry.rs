@@ -15,6 +15,7 @@ mod surface;
 use super::json::read_bytes;
 use super::{Capture, Frame, PointCloud};
 use placed::Placed;
+use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Planes};
 use splat4d::{Error, Result};
@@ -281,8 +282,7 @@ fn spacing(points: &[[f64; 3]]) -> f64 {
         others.fold(f64::INFINITY, f64::min)
     };
     let mut all: Vec<f64> = points.iter().step_by(step).map(nearest).filter(|d| d.is_finite()).collect();
-    all.sort_by(f64::total_cmp);
-    2.0 * all.get(all.len() / 2).copied().unwrap_or(1.0)
+    2.0 * median(&mut all).unwrap_or(1.0)
 }
 
 /// The error of a scan that is in no image: where it is, and where cameras are.

@@ -60,8 +60,8 @@ settings! {
     }
 }
 
-/// Half of the residual of what vanishes is gone at this threshold, and nothing else is lost; at half of it a hall lost
-/// 0.15 dB (studies/records/2026-11-28-lifespans.md).
+/// At this threshold nearly half of what was left of a vanished object is gone and scores stay; at 7e-5 a hall lost 0.2 dB
+/// (studies/records/2026-11-28-lifespans.md).
 const LIFE_THRESHOLD: f64 = 1e-4;
 
 /// [`AdcSettings::percent_dense`] where it is 0, for few Gaussians (Kerbl et al. 2023).

@@ -11,6 +11,7 @@ use crate::recipe::Recipe;
 use crate::{Error, Result};
 use serde_json::json;
 use splat4d::layers::Scene;
+use splat4d::math::median;
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer};
 use std::path::Path;
 
@@ -76,14 +77,10 @@ pub(super) fn after(
         return Ok(None);
     }
     let rows = rows(opened, scene, recipe)?;
-    let median = |mut values: Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        values.get(values.len() / 2).copied()
-    };
     let frames: usize = rows.iter().map(|r| r.frames).sum();
     let measured = rows.iter().map(|r| r.measured * r.frames as f64).sum::<f64>() / frames.max(1) as f64;
     let compared: Vec<(&Row, f64)> = rows.iter().filter_map(|r| Some((r, r.errors?[0]))).collect();
-    let error = median(compared.iter().map(|c| c.1).collect());
+    let error = median(&mut compared.iter().map(|c| c.1).collect::<Vec<_>>());
     let worst = compared.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.camera.cmp(&a.0.camera)));
     let worst = worst.map(|(row, error)| (capture.cameras[row.camera].name.clone(), *error));
     let cameras: Vec<serde_json::Value> = rows

@@ -170,22 +170,3 @@ fn a_ladder_is_reported_rung_by_rung_and_stated_in_the_file() {
     let error = bake_into(&source(&Leaps::default()), "wrong", &out, &wrong, &ignore).unwrap_err().to_string();
     assert!(error.contains("invalid ladder 8,4"), "{error}");
 }
-
-/// Rungs of the file that SCENE names at the rates of LADDER (Mbit/s), ranked once and round by round.
-#[test]
-#[ignore = "a study: studies/records/2026-11-28-ladder.md"]
-fn rungs_ranked_once_and_round_by_round() {
-    let [scene, rates] = ["SCENE", "LADDER"].map(|name| std::env::var(name).expect("SCENE and LADDER are set"));
-    let source = Source::open(Path::new(&scene)).unwrap();
-    let ladder: Vec<f64> = rates.split(',').map(|rate| rate.parse().unwrap()).collect();
-    for peel in [false, true] {
-        let options = Options { peel, ..Options::default() };
-        let baking = Baking { options, ladder: ladder.clone(), bytes: Some(1 << 30), ..Baking::default() };
-        let began = std::time::Instant::now();
-        let cooked = bake_like(&source, "study", &baking, &ignore).unwrap();
-        let seconds = began.elapsed().as_secs_f64();
-        let bytes = &cooked.packed.bytes;
-        let rungs = ladder::report(bytes, &compared(&source).unwrap(), &baking.deadline, &ignore).unwrap();
-        println!("round by round: {peel}, {seconds:.1} s\n{}", ladder::in_words(&rungs).join("\n"));
-    }
-}

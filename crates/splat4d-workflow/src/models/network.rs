@@ -21,7 +21,7 @@ pub(super) struct Declared {
 #[cfg(feature = "models")]
 pub(super) use real::Network;
 #[cfg(not(feature = "models"))]
-pub(super) use stub::Network;
+pub(super) use without::Network;
 
 /// The mark of an attribute that requests cubic interpolation (protobuf: field 4, five bytes).
 #[cfg(feature = "models")]
@@ -189,7 +189,7 @@ mod real {
 }
 
 #[cfg(not(feature = "models"))]
-mod stub {
+mod without {
     use super::{Declared, Path, Result, Tensor};
     use crate::parts::left_out;
 

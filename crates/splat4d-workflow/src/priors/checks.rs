@@ -5,6 +5,7 @@ use crate::deadline::unless_stopped;
 use crate::events::Listener;
 use serde_json::{Value, json};
 use splat4d::Result;
+use splat4d::math::median;
 use splat4d::scene::Planes;
 use splat4d_train::capture::{Capture, DepthKind, ImageStore};
 use std::collections::BTreeMap;
@@ -136,10 +137,6 @@ fn pairs(frames: &BTreeMap<usize, usize>) -> Vec<[usize; 2]> {
 /// Evenly spread frames.
 fn some(frames: &BTreeMap<usize, usize>) -> impl Iterator<Item = usize> {
     frames.values().copied().step_by(frames.len().div_ceil(LOOKED_AT).max(1))
-}
-
-fn median(values: &mut [f64]) -> Option<f64> {
-    splat4d::math::median(values)
 }
 
 fn depth(capture: &Capture, store: &ImageStore, frames: &BTreeMap<usize, usize>, row: &mut Row) -> Result<()> {

@@ -155,5 +155,10 @@ mod tests {
         assert!(with(&|b| b[107..111].fill(255)).contains("4294967295"));
         assert!(with(&|b| b[105] = 3).contains("at least 20"));
         assert!(with(&|b| b[131..139].fill(0)).contains("scale"));
+        // Without points it does not matter where they would begin.
+        let mut none = good.clone();
+        none[107..111].fill(0);
+        none[96..100].fill(255);
+        assert!(read(&none).unwrap().points.is_empty());
     }
 }
