@@ -212,7 +212,7 @@ impl PointCloud {
         let (mut coarse, mut fine) = (0.0, MAX_CELLS.log2());
         for _ in 0..STEPS {
             let middle: f64 = 0.5 * (coarse + fine);
-            let count = self.cells(low, middle.exp2() / side).chunk_by(|a, b| a.0 == b.0).count();
+            let count = self.count_cells(low, middle.exp2() / side);
             *(if count <= max_points { &mut coarse } else { &mut fine }) = middle;
         }
         let sorted = self.cells(low, f64::exp2(coarse) / side);
@@ -239,18 +239,30 @@ impl PointCloud {
 
     /// The cell of every point, sorted by cell and then by point.
     fn cells(&self, low: [f64; 3], per_unit: f64) -> Vec<(Cell, usize)> {
-        let cell_of = |(i, p): (usize, &[f64; 3])| {
-            let cell = |k: usize| ((p[k] - low[k]) * per_unit).clamp(0.0, MAX_CELLS) as u64;
-            let place = (cell(0) << 42) | (cell(1) << 21) | cell(2);
-            ((place, self.times[i].map(f64::to_bits)), i)
-        };
+        let cell_of = |(i, p)| ((place(p, low, per_unit), self.times[i].map(f64::to_bits)), i);
         let mut cells: Vec<(Cell, usize)> = self.points.par_iter().enumerate().map(cell_of).collect();
         cells.par_sort_unstable();
         cells
     }
+
+    /// How many cells have points. Without times only a fifth of the bytes of [`Self::cells`] is sorted.
+    fn count_cells(&self, low: [f64; 3], per_unit: f64) -> usize {
+        if self.times.iter().any(Option::is_some) {
+            return self.cells(low, per_unit).chunk_by(|a, b| a.0 == b.0).count();
+        }
+        let mut places: Vec<u64> = self.points.par_iter().map(|p| place(p, low, per_unit)).collect();
+        places.par_sort_unstable();
+        places.chunk_by(|a, b| a == b).count()
+    }
 }
 
-/// A voxel's three numbers in one key, and the bits of a time.
+/// The voxel of a point: its three numbers in one key.
+fn place(p: &[f64; 3], low: [f64; 3], per_unit: f64) -> u64 {
+    let cell = |k: usize| ((p[k] - low[k]) * per_unit).clamp(0.0, MAX_CELLS) as u64;
+    (cell(0) << 42) | (cell(1) << 21) | cell(2)
+}
+
+/// A voxel, and the bits of a time.
 type Cell = (u64, Option<u64>);
 
 #[cfg(test)]
