@@ -239,7 +239,7 @@ impl PointCloud {
 
     /// The cell of every point, sorted by cell and then by point.
     fn cells(&self, low: [f64; 3], per_unit: f64) -> Vec<(Cell, usize)> {
-        let cell_of = |(i, p)| ((place(p, low, per_unit), self.times[i].map(f64::to_bits)), i);
+        let cell_of = |(i, p): (usize, &[f64; 3])| ((place(p, low, per_unit), self.times[i].map(f64::to_bits)), i);
         let mut cells: Vec<(Cell, usize)> = self.points.par_iter().enumerate().map(cell_of).collect();
         cells.par_sort_unstable();
         cells
