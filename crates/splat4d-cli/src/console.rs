@@ -272,6 +272,11 @@ impl Console {
                 self.clear();
                 self.print_line(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
             }
+            Event::Shell { distance, why } => {
+                self.clear();
+                let what = distance.map_or("no far shell".into(), |d| format!("far shell at {d:.1} scene units"));
+                self.print_line(&format!("{what}: {why}"));
+            }
             Event::Geometry { measured, error, worst, worst_error } => {
                 self.clear();
                 let percent = |share: f64| format!("{:.1} %", 100.0 * share);

@@ -110,6 +110,13 @@ pub enum Event {
         /// The reason from the capture.
         why: String,
     },
+    /// Whether the scene gets a far shell (`init.shell`), where cameras see much without near points.
+    Shell {
+        /// Its distance from the cameras' centre, scene units; none: there is no shell.
+        distance: Option<f64>,
+        /// The reason from points and images.
+        why: String,
+    },
     /// A checkpoint is on disk.
     Checkpoint {
         /// Steps taken.

@@ -7,6 +7,7 @@
 //! the points seen around it (1/z of a plane is affine in pixels).
 
 use super::Seeds;
+use super::sky::Sky;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
@@ -27,12 +28,13 @@ const BORDER: f64 = 0.15;
 /// Views that are covered, at most, evenly chosen.
 const VIEWS: usize = 100;
 /// Foreground in the masks moves: other points represent it.
-const FOREGROUND: f32 = 0.5;
+pub(super) const FOREGROUND: f32 = 0.5;
 
-/// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them.
-pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> Result<Seeds> {
+/// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them, and none before
+/// the `sky`, where there are no surfaces between points.
+pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize, sky: Option<&Sky>) -> Result<Seeds> {
     let mut out = Seeds::default();
-    let views = views(frames);
+    let views = views(frames, VIEWS);
     if views.is_empty() || known.len() < NEIGHBOURS {
         return Ok(out);
     }
@@ -52,11 +54,13 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> 
         }
         let (columns, rows) = ((camera.width as f64 / step) as usize, (camera.height as f64 / step) as usize);
         let at = |k: usize| [(k % columns) as f64, (k / columns) as f64].map(|c| (c + 0.5) * step);
+        let far = sky.map(|sky| sky.of_camera(camera));
         let depths: Vec<Option<f64>> = (0..columns * rows)
             .into_par_iter()
             .map(|k| {
                 let [u, v] = at(k);
-                (!blocked(u as usize, v as usize)).then(|| depth(&seen, [u, v]))
+                let left_out = blocked(u as usize, v as usize) || far.as_ref().is_some_and(|far| far([u, v]));
+                (!left_out).then(|| depth(&seen, [u, v]))
             })
             .collect();
         for (k, z) in depths.into_iter().enumerate() {
@@ -70,15 +74,15 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> 
     Ok(out)
 }
 
-/// One image of every fixed camera, and of every position of moving ones.
-fn views(frames: &dyn Frames) -> Vec<usize> {
+/// One image of every fixed camera, and of every position of moving ones; at most so many, evenly chosen.
+pub(super) fn views(frames: &dyn Frames, most: usize) -> Vec<usize> {
     let mut places = HashSet::new();
     let new = |&i: &usize| {
         let pose = &frames.camera(i).cam_from_world;
         places.insert((pose.rotation.map(|row| row.map(f64::to_bits)), pose.translation.map(f64::to_bits)))
     };
     let all: Vec<usize> = (0..frames.len()).filter(new).collect();
-    let count = all.len().min(VIEWS);
+    let count = all.len().min(most);
     (0..count).map(|k| all[k * all.len() / count]).collect()
 }
 
@@ -176,8 +180,8 @@ mod tests {
     #[test]
     fn too_few_points_or_a_cloud_behind_the_cameras_give_none() {
         let frames = crate::step::tests::Made::new(6, 2, 8);
-        assert!(between(&frames, &[[0.0; 3]; NEIGHBOURS - 1], 100).unwrap().is_empty());
-        let many = between(&frames, &vec![[0.0, 0.0, 0.0]; NEIGHBOURS], 100).unwrap();
+        assert!(between(&frames, &[[0.0; 3]; NEIGHBOURS - 1], 100, None).unwrap().is_empty());
+        let many = between(&frames, &vec![[0.0, 0.0, 0.0]; NEIGHBOURS], 100, None).unwrap();
         assert!(many.points.iter().all(|x| x.iter().all(|v| v.is_finite())));
         assert!(many.len() <= 110, "{} points", many.len());
     }
@@ -185,6 +189,6 @@ mod tests {
     #[test]
     fn depth_of_fixed_cameras_is_read_once() {
         let frames = crate::step::tests::Made::new(6, 2, 8);
-        assert_eq!(views(&frames).len(), 6);
+        assert_eq!(views(&frames, VIEWS).len(), 6);
     }
 }

@@ -1,5 +1,5 @@
 //! Initial Gaussians: from the capture's points or depth maps, the visual hulls of masks or of dynamic regions at
-//! several times, or random points in the cameras' common volume.
+//! several times, or random points in the cameras' common volume; and a far shell behind them.
 
 mod depth;
 pub(crate) mod fill;
@@ -7,13 +7,16 @@ pub(crate) mod hull;
 mod map;
 pub(crate) mod scan;
 mod scene_flow;
+mod shell;
+pub(crate) mod sky;
 pub(crate) mod volume;
 
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
 use crate::methods::{InitialMotion, Method, TrainContext};
-use crate::settings::{Value, among, settings};
+use crate::settings::{Value, among, choices, settings};
 use crate::{Error, Result};
+use sky::Sky;
 use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
@@ -36,6 +39,8 @@ pub struct Seeds {
     pub velocities: Vec<[f64; 3]>,
     /// Width of the lifespans of points with a time, seconds; `None`: the recipe's.
     pub life: Option<f64>,
+    /// The far shell, without points where there is none.
+    pub(crate) shell: shell::Shell,
 }
 
 impl Seeds {
@@ -43,7 +48,7 @@ impl Seeds {
     pub(crate) fn of(cloud: &PointCloud) -> Self {
         let velocities = vec![[0.0; 3]; cloud.points.len()];
         let (points, colors, times) = (cloud.points.clone(), cloud.colors.clone(), cloud.times.clone());
-        Self { points, colors, times, velocities, life: None }
+        Self { points, colors, times, velocities, ..Self::default() }
     }
 
     /// Number of points.
@@ -85,8 +90,8 @@ impl Seeds {
 
     /// Keeps those that the rule selects.
     fn retain(&mut self, rule: impl Fn(usize, &Self) -> bool) {
-        let old = std::mem::take(self);
-        self.life = old.life;
+        let mut old = std::mem::take(self);
+        (self.life, self.shell) = (old.life, std::mem::take(&mut old.shell));
         for i in (0..old.len()).filter(|&i| rule(i, &old)) {
             self.push(old.points[i], old.colors[i], old.times[i]);
             self.velocities[self.points.len() - 1] = old.velocities[i];
@@ -112,6 +117,30 @@ settings! {
         /// the coverage of dynamic regions.
         life: f64 = 0.0
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
+        /// Static Gaussians on a far sphere where cameras see beyond the points (a sky, a horizon): auto, on or off.
+        shell: FarShell = FarShell::Auto
+            => any().when(All(&[IsNot("run.motion", &["tracked"]), IsNot("densify.strategy", &["mcmc"])]));
+        /// Distance of the far shell from the cameras' centre; 0: where the images agree best.
+        shell_distance: f64 = 0.0 => any().unit("extents").when(Is("init.shell", &["auto", "on"]));
+    }
+}
+
+choices! {
+    /// Whether a scene has a far shell.
+    pub enum FarShell {
+        /// If images fit a far distance where they show no near points.
+        Auto = "auto",
+        /// Yes.
+        On = "on",
+        /// No.
+        Off = "off",
+    }
+}
+
+impl InitSettings {
+    /// The distance of the far shell, extents; `None`: there is none, or whether there is one has not been decided.
+    pub(crate) fn shell_at(&self) -> Option<f64> {
+        (self.shell == FarShell::On && self.shell_distance > 0.0).then_some(self.shell_distance)
     }
 }
 
@@ -240,12 +269,26 @@ pub fn seeds(
     out.append(seen);
     if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
+    }
+    let sky = match plan.shell {
+        Some(distance) => {
+            let still: Vec<[f64; 3]> =
+                (0..out.len()).filter(|&i| out.times[i].is_none()).map(|i| out.points[i]).collect();
+            let mut sky = Sky::open(frames, &still, plan.center, plan.extent)?;
+            sky.mark(distance * plan.extent);
+            // Points before it are matches of what repeats or of noise.
+            out.retain(|i, s| s.times[i].is_some() || !sky.hides(s.points[i]));
+            Some(sky)
+        }
+        None => None,
+    };
+    if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         let filled = matches!(settings.source, Source::Auto | Source::Pictures);
         if filled && !have_depth && out.len() < count {
             // Surfaces that move are elsewhere at other times.
             let still = (0..out.len()).filter(|&i| out.times[i].is_none());
             let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
-            out.append(fill::between(frames, &known, count - out.len())?);
+            out.append(fill::between(frames, &known, count - out.len(), sky.as_ref())?);
         }
     }
     if have_depth {
@@ -257,7 +300,11 @@ pub fn seeds(
     } else if settings.source == Source::Random || !have_points {
         out.append(volume::random(frames, &volume, count, moving.then_some(plan.clip), rng.fork(2)));
     }
-    out.truncate_evenly(plan.common.densify.max_cap, rng.fork(3));
+    let cap = plan.common.densify.max_cap;
+    if let Some(sky) = sky {
+        out.shell = shell::Shell::new(&sky, count, cap);
+    }
+    out.truncate_evenly(cap.saturating_sub(out.shell.len()).max(1), rng.fork(3));
     Ok(out)
 }
 
@@ -282,7 +329,8 @@ pub(crate) fn one_time(
     Ok(out)
 }
 
-/// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same time.
+/// A layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same time. Behind it
+/// the far shell, where the seeds have one.
 pub fn scene(
     plan: &TrainContext,
     settings: &InitSettings,
@@ -322,8 +370,11 @@ pub fn scene(
     let motion = program.build(plan, &mut params)?;
     program.init(plan, &beginnings, &mut params);
     let head = if HeadKeys::of(&params).is_some() { Head::Features } else { Head::Identity };
-    let layer = Layer::new("scene", params, motion, life);
-    let (layers, clip, fps) = (vec![layer], plan.clip, plan.fps);
+    let mut layers = vec![Layer::new("scene", params, motion, life)];
+    if seeds.shell.len() > 0 {
+        layers.push(seeds.shell.layer(plan));
+    }
+    let (clip, fps) = (plan.clip, plan.fps);
     Ok(Scene { layers, background, clip, fps, up, head, ..Scene::default() })
 }
 

@@ -111,6 +111,8 @@ pub struct TrainContext {
     pub moments: Vec<(f64, usize)>,
     /// Whether training images have masks.
     pub masks: bool,
+    /// Distance of the far shell from the cameras' centroid, extents; `None`: there is none.
+    pub shell: Option<f64>,
 }
 
 impl TrainContext {
@@ -411,7 +413,26 @@ pub(crate) fn stages(program: &dyn Method, plan: &TrainContext) -> Vec<Stage> {
         last.keep(split);
         share_groups(last);
     }
+    if let Some(distance) = plan.shell {
+        stages.iter_mut().for_each(|stage| shell_groups(stage, distance));
+    }
     stages
+}
+
+/// The layer of the far shell, where a scene has one.
+pub(crate) const SHELL_LAYER: usize = 1;
+
+/// Lets the far shell learn as the first layer does, but with positions in proportion to its distance (extents): a step
+/// then turns the ray to a Gaussian as far as a step of a near one does. The groups are last, so that they apply and not
+/// those of every layer.
+fn shell_groups(stage: &mut Stage, distance: f64) {
+    let of_first = |g: &&Group| g.is_of(0) && STILL_COLUMNS.contains(&g.column.as_str());
+    let groups: Vec<Group> = stage.groups.iter().filter(of_first).cloned().collect();
+    stage.groups.extend(groups.into_iter().map(|g| {
+        let factor = if g.column == "means" { distance } else { 1.0 };
+        let rate = Rate { start: factor * g.rate.start, end: factor * g.rate.end };
+        Group { layer: SHELL_LAYER, rate, ..g }
+    }));
 }
 
 /// Lets what a still layer has learn in all layers.

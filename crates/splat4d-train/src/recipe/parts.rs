@@ -88,6 +88,7 @@ impl Recipe {
             batch_size: r.run.batch_size,
             half_size_until: r.run.half_size_until,
             predicted: r.capture.observe < 1.0,
+            shell: r.init.shell_at(),
             common: operations! { tables common {} {} },
             ..TrainContext::default()
         }

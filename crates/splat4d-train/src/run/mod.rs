@@ -8,6 +8,7 @@ mod clock;
 pub mod corrected;
 mod count;
 pub mod dataset;
+mod far;
 mod flows;
 mod identity;
 mod info;

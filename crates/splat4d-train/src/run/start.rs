@@ -4,6 +4,7 @@ use super::aligned::aligned;
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
 use super::count::settled;
+use super::far;
 use super::flows;
 use super::identity::identity;
 use super::info::{read_info, read_text};
@@ -68,6 +69,7 @@ pub fn train(
     for message in priors::before(&opened, &recipe)?.into_iter().chain(early).chain(unfitted).chain(warning) {
         listen(&Event::Warning { message });
     }
+    let recipe = far::decided(&opened, recipe, &mut listen)?;
     let timed = timed(&opened, recipe, options, &mut listen)?;
     let recipe = timed.recipe.resolve();
     let plan = opened.plan(&recipe);

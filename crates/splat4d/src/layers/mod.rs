@@ -46,6 +46,10 @@ pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 /// Beginning of the names of layers that show what was predicted, not what was seen.
 pub const PREDICTED: &str = "predicted";
 
+/// Name of a layer of static Gaussians on a far sphere around the cameras: a sky, a far landscape. It is seen, and is no
+/// part of surfaces and boxes.
+pub const FAR_SHELL: &str = "far shell";
+
 /// Gaussians with one motion model and one kind of lifespan.
 pub struct Layer<F: Real = f32> {
     /// The user's name for it.

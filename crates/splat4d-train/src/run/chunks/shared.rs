@@ -23,9 +23,10 @@ use rayon::prelude::*;
 use serde_json::json;
 use splat4d::Error;
 use splat4d::format::{safetensors::SafeTensors, scene};
-use splat4d::layers::{Layer, Scene};
+use splat4d::layers::{Layer, Scene, freeze};
 use splat4d::math::{Rng, median_by};
-use splat4d::scene::{Camera, RowEdit, Space};
+use splat4d::motion::Still;
+use splat4d::scene::{Camera, LifeKind, RowEdit, Space, Time};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -96,7 +97,7 @@ pub(super) fn train(
     if !outcome.interrupted {
         let mut learnt = read_scene(&folder.join(super::SCENE))?;
         calm_only(&mut learnt, &open_capture(&source, &of_medians(&chunked.recipe))?, &source)?;
-        write_still(&folder, learnt)?;
+        write_still(&folder, joined(learnt)?)?;
     }
     Ok(Some(outcome))
 }
@@ -304,6 +305,15 @@ fn is_calm(mean: [f64; 3], views: &[(Camera, Vec<u8>)]) -> bool {
         }
     }
     seen > 0 && calm as f64 >= AGREED * f64::from(seen)
+}
+
+/// The scene with a far shell and what is before it in one layer: chunks take over one.
+fn joined(scene: Scene<f32>) -> Result<Scene<f32>> {
+    if scene.layers.len() < 2 {
+        return Ok(scene);
+    }
+    let still = Layer::new(LAYER, freeze(&scene, Time(scene.clip[0]))?, Arc::new(Still), LifeKind::Infinite);
+    Ok(Scene { layers: vec![still], ..scene })
 }
 
 fn write_still(folder: &Path, scene: Scene<f32>) -> Result<()> {

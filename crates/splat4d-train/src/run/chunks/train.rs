@@ -6,7 +6,7 @@ use super::{Chunked, MADE_BY, Part, SCENE};
 use crate::Result;
 use crate::capture::Capture;
 use crate::event::Event;
-use crate::init::Seeds;
+use crate::init::{FarShell, Seeds};
 use crate::methods::{TrainContext, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
@@ -86,8 +86,8 @@ pub(super) fn train(
 pub(super) fn of_frames(recipe: &Recipe, frames: Range<usize>) -> Recipe {
     recipe.clone().with(|r| {
         (r.capture.first_frame, r.capture.max_frames) = (frames.start, frames.len());
-        // The static background is a layer already.
-        r.split.reach = 0.0;
+        // The static background is a layer already, and what is far is a part of it.
+        (r.split.reach, r.init.shell) = (0.0, FarShell::Off);
     })
 }
 
