@@ -9,6 +9,7 @@ pub mod corrected;
 mod count;
 pub mod dataset;
 mod flows;
+pub mod follow;
 mod identity;
 mod info;
 mod left;
