@@ -47,9 +47,11 @@
 //! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, rolling shutter and motion blur (`shutter.rs`), pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
 //! | `recipe.rs`, `recipe/` | all settings of a run, and the programs and plans built from them (`parts.rs`); TOML, `--set`, old names without tables |
 //! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
+//! | `blended.rs` | values of Gaussians as images blend them |
 //! | `run/` | the run on disk: open, start and resume, from checkpoint to checkpoint, rollback, points and flow found in images, checks of priors and of measured geometry, memory estimate, `--minutes`, identity, metrics |
 //! | `run/chunks/` | long captures in chunks: budget, plan, shared layer, training of a chunk, ties to neighbours, join |
-//! | `blended.rs`, `labels.rs`, `features.rs` | values of Gaussians as images blend them; labels from masks by expectation-maximisation; feature channels by conjugate gradients |
+//! | `run/follow/` | captures that are still being filmed: arrival of frames, changed Gaussians, the files of frames, nodes of the playback file |
+//! | `labels.rs`, `features.rs` | labels from masks by expectation-maximisation; feature channels by conjugate gradients |
 //! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of tracks and flow, alignment of held-out cameras, trajectory errors, localisation, floaters, `results.json` and `per_view.json` |
 //! | `compress/`, `compress/quantise/` | settings, rounds of pruning, settings for a size; fine-tuning through the file's quantisation (straight-through) |
 

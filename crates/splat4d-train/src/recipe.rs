@@ -8,6 +8,7 @@
 
 mod chunks;
 mod flat;
+mod follow;
 pub(crate) mod parts;
 mod quality;
 mod run;
@@ -24,6 +25,7 @@ use crate::settings::Table;
 use crate::step::replans::ScheduleChanges;
 use crate::train_state::RefineSettings;
 pub use chunks::ChunkSettings;
+pub use follow::FollowSettings;
 pub use quality::Quality;
 pub use run::{MotionName, RunSettings};
 
@@ -52,7 +54,7 @@ macro_rules! recipe {
 
 // The tables of motion models and of maintenance are listed where these are; here they get their place.
 macro_rules! with_maintenance {
-    ($($tables:tt)*) => { operations! { tables recipe { $($tables)* } { chunks: ChunkSettings, } } };
+    ($($tables:tt)*) => { operations! { tables recipe { $($tables)* } { chunks: ChunkSettings, follow: FollowSettings, } } };
 }
 
 methods! { tables with_maintenance {

@@ -6,6 +6,7 @@
 //! into captures, so all layouts are checked alike.
 
 mod account;
+mod arriving;
 mod assemble;
 mod borders;
 mod colmap;
@@ -55,6 +56,7 @@ mod tracks;
 mod transforms;
 
 pub use account::{Aspect, Remark, Severity};
+pub(crate) use arriving::{frame_files, growing_root};
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
 pub(crate) use depth::{DepthFit, read as depth_map};

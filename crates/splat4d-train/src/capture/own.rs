@@ -515,13 +515,13 @@ fn read_lens(node: &Node<'_>) -> Result<Lens> {
 }
 
 /// The files of a camera: a printf pattern or a list.
-enum Files {
+pub(super) enum Files {
     Pattern { before: String, digits: usize, after: String },
     List(Vec<String>),
 }
 
 impl Files {
-    fn read(node: &Node<'_>) -> Result<Self> {
+    pub(super) fn read(node: &Node<'_>) -> Result<Self> {
         let Some(text) = node.value.as_str() else {
             return Ok(Self::List(node.list()?.iter().map(|n| n.text().map(str::to_string)).collect::<Result<_>>()?));
         };
@@ -544,12 +544,12 @@ impl Files {
     }
 
     /// The file of a frame, or where it should be.
-    fn path(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<PathBuf>> {
+    pub(super) fn path(&self, lookup: &Lookup, start: usize, index: usize) -> Result<Option<PathBuf>> {
         self.text(start, index).map(|name| lookup.file(&name)).transpose()
     }
 
     /// The file's name as the capture writes it.
-    fn text(&self, start: usize, index: usize) -> Option<String> {
+    pub(super) fn text(&self, start: usize, index: usize) -> Option<String> {
         match self {
             Self::List(names) => names.get(index).cloned(),
             Self::Pattern { before, digits, after } => {

@@ -19,6 +19,11 @@ impl Dataset {
         Self { capture: store.capture().clone(), store, frames }
     }
 
+    /// The images of all of the capture's frames.
+    pub(crate) fn store(&self) -> &Arc<ImageStore> {
+        &self.store
+    }
+
     /// The capture whose frames they are.
     pub(crate) fn capture(&self) -> &Arc<Capture> {
         &self.capture

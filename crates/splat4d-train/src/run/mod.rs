@@ -10,6 +10,7 @@ mod count;
 pub mod dataset;
 mod far;
 mod flows;
+pub mod follow;
 mod identity;
 mod info;
 mod left;

@@ -1,0 +1,472 @@
+//! Captures that are still being filmed: the first frame as a static scene, then frame by frame only the Gaussians whose
+//! pixels changed, so that the scene grows while images arrive.
+//!
+//! A frame is a function of the capture's images, the recipe and the frames before it. Its changes are one file, written
+//! when the frame is done: a run that is stopped or killed loses at most the frame that it was at.
+//!
+//! Source: online training frame by frame as Luiten et al. 2024 (Dynamic 3D Gaussians) and Sun et al. 2024 (3DGStream);
+//! which Gaussians learn is decided by images, in the spirit of the gates of QUEEN (Girish et al. 2024). The selection
+//! by tiles and weights is ours.
+
+mod arrival;
+mod changed;
+mod fit;
+mod history;
+mod record;
+#[cfg(test)]
+mod tests;
+
+pub use arrival::{Arrival, END_MARKER};
+
+use super::checkpoint::write_atomically;
+use super::identity::{fingerprint, recipe_print};
+use super::info::{ELSEWHERE, elsewhere, read_text};
+use super::open::{OpenCapture, capture_options, open_frames};
+use super::{peak_memory, points};
+use crate::capture::{Capture, CaptureOptions, Lenses, growing_root};
+use crate::event::Event;
+use crate::path_text::{of_text, to_text};
+use crate::recipe::Recipe;
+use crate::{Error, Result};
+use changed::{Comparison, TileErrors};
+use fit::{Fit, drive, first_recipe, first_record};
+use history::History;
+use record::Record;
+use serde_json::{Value, json};
+use splat4d::device::Device;
+use splat4d::format::playback::Node;
+use splat4d::layers::Scene;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// Folder of the frames in a run.
+const FOLDER: &str = "frames";
+/// The file in it that states what is followed.
+const PLAN: &str = "follow.json";
+/// The verb that made the run.
+const MADE_BY: &str = "train --follow";
+
+/// What a frame became.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FollowedFrame {
+    /// Its number.
+    pub frame: usize,
+    /// Its time, seconds.
+    pub time: f64,
+    /// Seconds that it took, images read and compared.
+    pub seconds: f64,
+    /// Gaussians of the scene.
+    pub gaussians: usize,
+    /// Gaussians that were replaced or added.
+    pub changed: usize,
+    /// Mean PSNR of its held-out views, dB; none: no camera is held out.
+    pub psnr: Option<f64>,
+}
+
+/// A capture that is followed into a run folder.
+pub struct Following {
+    run: PathBuf,
+    root: PathBuf,
+    recipe: Recipe,
+    options: CaptureOptions,
+    device: Device,
+    watch: arrival::Watch,
+    lenses: Lenses,
+    /// Names and views of the cameras of the first frame.
+    rig: Option<String>,
+    facts: Value,
+    /// The next frame.
+    next: usize,
+    state: Option<State>,
+}
+
+/// The scene so far.
+struct State {
+    history: History,
+    exposure: Vec<f32>,
+    errors: TileErrors,
+    shell: Scene<f32>,
+}
+
+impl Following {
+    /// Begins to follow a capture, or continues the run in the folder `run`, of which all frames are read.
+    ///
+    /// Errors: the folder has no `capture.json`; the folder holds the run of another capture or recipe.
+    pub fn begin(capture: &Path, recipe: &Recipe, run: &Path, device: Device) -> Result<Self> {
+        let root = growing_root(capture)?;
+        let root = std::fs::canonicalize(root).unwrap_or_else(|_| root.to_path_buf());
+        check(recipe)?;
+        let plan = json!({"version": env!("CARGO_PKG_VERSION"), "capture": to_text(&root), "recipe": recipe_print(recipe, "")});
+        let file = run.join(FOLDER).join(PLAN);
+        if Self::is(run) {
+            let begun = read_plan(&file)?;
+            if let Some(key) = ["version", "capture", "recipe"].into_iter().find(|key| begun[*key] != plan[*key]) {
+                return Err(Error::input(format!("the folder holds a run of another {key}"))
+                    .at(run.display())
+                    .remedy("Use the same command, or another folder"));
+            }
+        } else {
+            write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+            write_atomically(&file, format!("{plan:#}\n").as_bytes())?;
+        }
+        let mut following = Self {
+            run: run.to_owned(),
+            options: capture_options(recipe)?,
+            root,
+            recipe: recipe.clone(),
+            device,
+            watch: arrival::Watch::default(),
+            lenses: Lenses::default(),
+            rig: None,
+            facts: Value::Null,
+            next: recipe.capture.first_frame,
+            state: None,
+        };
+        for frame in record::list(&following.folder()) {
+            following.replay(frame)?;
+        }
+        Ok(following)
+    }
+
+    /// Whether a folder is the run of a followed capture.
+    pub fn is(run: &Path) -> bool {
+        run.join(FOLDER).join(PLAN).is_file()
+    }
+
+    /// The capture and the recipe of a run, to [`begin`](Self::begin) it again. Errors: it is none, or damaged.
+    pub fn request(run: &Path) -> Result<(PathBuf, Recipe)> {
+        let plan = read_plan(&run.join(FOLDER).join(PLAN))?;
+        let file = run.join(FOLDER).join("recipe.toml");
+        let file = if file.is_file() { file } else { run.join("recipe.toml") };
+        let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
+        let capture = plan["capture"].as_str().map(of_text).ok_or_else(|| {
+            Error::input("it does not name its capture")
+                .at(run.display())
+                .remedy("Follow the capture into another folder")
+        })?;
+        Ok((capture, recipe))
+    }
+
+    fn folder(&self) -> PathBuf {
+        self.run.join(FOLDER)
+    }
+
+    /// The capture's folder.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The next frame's number.
+    pub fn next(&self) -> usize {
+        self.next
+    }
+
+    /// The first frame's number.
+    pub fn first(&self) -> usize {
+        self.recipe.capture.first_frame
+    }
+
+    /// The settings.
+    pub fn recipe(&self) -> &Recipe {
+        &self.recipe
+    }
+
+    /// Looks whether a frame has arrived: the next one, or a later one. Errors: an image of another size.
+    pub fn look(&mut self, frame: usize) -> Result<Arrival> {
+        let most = self.recipe.capture.max_frames;
+        if most > 0 && frame >= self.first().saturating_add(most) {
+            return Ok(Arrival::Ended);
+        }
+        self.watch.look(&self.root, frame, &self.options)
+    }
+
+    /// Leaves the next frame out: the scene stays as it is for its duration.
+    pub fn skip(&mut self) {
+        self.next += 1;
+    }
+
+    /// One frame of the capture.
+    fn capture(&self, frame: usize) -> Result<Arc<Capture>> {
+        let recipe = self.recipe.clone().with(|r| (r.capture.first_frame, r.capture.max_frames) = (frame, 1));
+        let one = frame..frame + 1;
+        let capture = open_frames(&self.root, &recipe, vec![one], &self.lenses)?;
+        Ok(Arc::new(capture))
+    }
+
+    /// Learns the next frame, which is complete. `None`: a stop was requested, and the frame is not part of the run.
+    ///
+    /// Errors: an image cannot be read; the cameras are not those of the first frame; training of the first frame
+    /// diverged; the files cannot be written. The run can be continued after any of them.
+    pub fn fit(&mut self, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> Result<Option<FollowedFrame>> {
+        let (began, frame) = (Instant::now(), self.next);
+        let mut listen = listen;
+        let capture = self.capture(frame)?;
+        self.check_rig(&capture)?;
+        let opened = OpenCapture::new(capture.clone(), &self.recipe)?.on(self.device);
+        let record = match self.state.take() {
+            None => self.fit_first(opened, stop, &mut listen)?,
+            Some(state) => {
+                let learnt = self.fit_next(&opened, &state, stop, &mut listen);
+                self.state = Some(state);
+                learnt?
+            }
+        };
+        let Some(mut record) = record else { return Ok(None) };
+        if self.state.is_none() {
+            record.facts = self.facts.clone();
+        }
+        record.write(&self.folder())?;
+        let changed = record.params.len();
+        self.apply(&record);
+        let (gaussians, psnr) = self.score(&capture)?;
+        let (time, seconds) = (self.seconds(frame), began.elapsed().as_secs_f64());
+        Ok(Some(FollowedFrame { frame, time, seconds, gaussians, changed, psnr }))
+    }
+
+    /// The first frame: as a static scene from the capture's points.
+    fn fit_first(
+        &mut self,
+        opened: OpenCapture,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Record>> {
+        let mut listen = listen;
+        let recipe = first_recipe(&self.recipe);
+        let opened = points::complete(opened, &recipe, &self.run, &mut listen)?;
+        let recipe = opened.counted(recipe, &mut listen)?.resolve();
+        let plan = opened.plan(&recipe);
+        let scene = opened.initial_scene(&recipe, &plan)?;
+        let mut trainer = opened.trainer(&recipe, &plan, scene)?;
+        trainer.check_not_empty()?;
+        if !drive(&mut trainer, "the first frame", stop, &mut listen)? {
+            return Ok(None);
+        }
+        let exposure = trainer.train_state.exposure.take();
+        let scene = trainer.train_state.into_scene();
+        let (capture, frames) = (&opened.capture, &opened.frames);
+        let compared =
+            Comparison { scene: &scene, capture, frames, numbers: &capture.train, exposure: exposure.as_ref() };
+        let (errors, _) = compared.errors()?;
+        self.lenses = capture.lenses.clone();
+        self.facts = json!({
+            "max_cap": recipe.densify.max_cap, "background": scene.background, "up": scene.up, "offset": scene.offset,
+            "fps": capture.fps, "rig": self.rig, "name": capture.name, ELSEWHERE: elsewhere(capture),
+            "fingerprint": fingerprint(capture),
+        });
+        Ok(Some(first_record(self.next, &scene, exposure.as_ref(), errors)))
+    }
+
+    /// A later frame. One that cannot be learnt changes nothing.
+    fn fit_next(
+        &self,
+        opened: &OpenCapture,
+        state: &State,
+        stop: &AtomicBool,
+        listen: &mut dyn FnMut(&Event),
+    ) -> Result<Option<Record>> {
+        let mut listen = listen;
+        let fit = Fit {
+            frame: self.next,
+            opened,
+            recipe: &self.recipe,
+            history: &state.history,
+            shell: &state.shell,
+            exposure: &state.exposure,
+            errors: &state.errors,
+        };
+        match fit.learn(stop, &mut listen) {
+            Err(e) if e.kind() == crate::ErrorKind::Diverged => {
+                listen(&Event::Warning {
+                    message: format!("frame {} keeps the scene of the one before: {e}", self.next),
+                });
+                Ok(Some(Record {
+                    frame: self.next,
+                    active: Vec::new(),
+                    params: splat4d::scene::Params::new(0, state.history.coefficients(), &[]),
+                    origin: Vec::new(),
+                    errors: state.errors.clone(),
+                    exposure: Vec::new(),
+                    facts: Value::Null,
+                }))
+            }
+            learnt => learnt,
+        }
+    }
+
+    /// Gaussians of the scene, and the mean PSNR of a frame's held-out views.
+    fn score(&self, capture: &Arc<Capture>) -> Result<(usize, Option<f64>)> {
+        let state = self.state.as_ref().expect("a frame was applied");
+        let opened = OpenCapture::new(capture.clone(), &self.recipe)?;
+        let psnr = fit::held_out(&opened, &state.history, &state.shell)?;
+        Ok((state.history.layer.params.len(), psnr))
+    }
+
+    /// Reads a frame that is done, and applies it.
+    fn replay(&mut self, frame: usize) -> Result<()> {
+        let record = Record::read(&self.folder(), frame)?;
+        let known = self.state.is_some() || !record.facts.is_null();
+        if frame < self.next || !known {
+            return Err(Error::input("files of frames before it are missing")
+                .at(self.folder().join(format!("{frame:06}.safetensors")).display())
+                .remedy("Restore them, or follow the capture into another folder"));
+        }
+        if self.state.is_none() {
+            self.facts = record.facts.clone();
+            self.rig = self.facts["rig"].as_str().map(str::to_owned);
+        }
+        if self
+            .state
+            .as_ref()
+            .is_some_and(|s| record.active.last().is_some_and(|r| *r as usize >= s.history.layer.params.len()))
+        {
+            return Err(Error::input("it replaces Gaussians that do not exist")
+                .at(self.folder().join(format!("{frame:06}.safetensors")).display())
+                .remedy("Delete this file and later ones of the folder: the frames are trained again"));
+        }
+        self.apply(&record);
+        Ok(())
+    }
+
+    fn apply(&mut self, record: &Record) {
+        self.next = record.frame + 1;
+        match &mut self.state {
+            Some(state) => {
+                state.history.apply(record);
+                state.errors.clone_from(&record.errors);
+            }
+            None => {
+                let facts = &self.facts;
+                let numbers =
+                    |key: &str| -> [f64; 3] { std::array::from_fn(|k| facts[key][k].as_f64().unwrap_or(0.0)) };
+                let shell = Scene {
+                    background: numbers("background").map(|x| x as f32),
+                    up: numbers("up"),
+                    offset: numbers("offset"),
+                    fps: facts["fps"].as_f64().unwrap_or(splat4d::scene::time::DEFAULT_FPS),
+                    ..Scene::default()
+                };
+                if let Some(cap) = facts["max_cap"].as_u64() {
+                    self.recipe.densify.max_cap = cap as usize;
+                }
+                let history = History::new(record.params.clone(), record.frame);
+                let (exposure, errors) = (record.exposure.clone(), record.errors.clone());
+                self.state = Some(State { history, exposure, errors, shell });
+            }
+        }
+    }
+
+    /// Errors: the cameras of a frame are not those of the first one, or it has images of other frames.
+    fn check_rig(&mut self, capture: &Capture) -> Result<()> {
+        let whole = capture.frames.len() == capture.cameras.len() && capture.fixed_cameras();
+        if !whole || capture.train.is_empty() {
+            return Err(Error::input("its frames cannot be read one by one").at(self.root.display()).remedy(
+                "Use at least two fixed cameras, and hold out cameras as a whole (option `hold_out` camera=0).",
+            ));
+        }
+        let rig: String = capture
+            .frames
+            .iter()
+            .map(|f| format!("{} {:?}\n", capture.cameras[f.camera].name, (&f.view.cam_from_world, &f.view.intrinsics)))
+            .collect();
+        let rig = super::identity::file_print(rig.as_bytes());
+        match &self.rig {
+            Some(first) if *first != rig => Err(Error::input("its cameras are not those of the first frame")
+                .at(self.root.join("capture.json").display())
+                .remedy("Put them back, or follow the capture into another folder.")),
+            _ => {
+                self.rig = Some(rig);
+                Ok(())
+            }
+        }
+    }
+
+    /// The seconds of a frame on the scene clock.
+    pub fn seconds(&self, frame: usize) -> f64 {
+        let fps = self.state.as_ref().map_or(splat4d::scene::time::DEFAULT_FPS, |s| s.shell.fps);
+        frame as f64 / fps
+    }
+
+    /// A scene without Gaussians: background, axes, rate, and the clip up to frame `end`, exclusive. `None`: no frame is
+    /// done.
+    pub fn shell(&self, end: usize) -> Option<Scene<f32>> {
+        let clip = [self.seconds(self.first()), self.seconds(end.saturating_sub(1))];
+        self.state.as_ref().map(|s| Scene { clip, ..s.shell.clone() })
+    }
+
+    /// Degree of the spherical harmonics.
+    pub fn sh_degree(&self) -> usize {
+        let coefficients = self.state.as_ref().map_or(1, |s| s.history.coefficients());
+        splat4d::math::sh::degree_of(coefficients).unwrap_or(0)
+    }
+
+    /// Some frames as parts of a playback file. Frames that were [forgotten](Self::forget) are incomplete.
+    pub fn nodes(&self, frames: Range<usize>) -> Vec<Node> {
+        self.state.as_ref().map_or_else(Vec::new, |s| s.history.nodes(frames, &|f| self.seconds(f)))
+    }
+
+    /// Frees the memory of frames before `frame`, which are in a file.
+    pub fn forget(&mut self, frame: usize) {
+        if let Some(state) = &mut self.state {
+            state.history.forget(frame);
+        }
+    }
+
+    /// The capture's first frame: its cameras. Errors: its images are no longer there.
+    pub fn beginning(&self) -> Result<Arc<Capture>> {
+        self.capture(self.first())
+    }
+
+    /// Writes what makes the folder a run on the frames that were followed: `recipe.toml` and `run.json`.
+    /// `finished`: whether all is done.
+    pub fn write_info(&self, seconds: f64, finished: bool) -> Result<()> {
+        let folder = self.folder();
+        let own = folder.join("recipe.toml");
+        if !own.is_file() {
+            // The one that the command gave: that of the run states what became of it.
+            write_atomically(&own, read_text(&self.run.join("recipe.toml"))?.as_bytes())?;
+        }
+        let frames = self.next - self.first();
+        let recipe = self.recipe.clone().with(|r| {
+            r.capture.max_frames = frames.max(1);
+            r.run.motion = crate::recipe::MotionName::of(crate::methods::still::NAME);
+        });
+        write_atomically(&self.run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+        let follow = &self.recipe.follow;
+        let steps = follow.first_steps + follow.frame_steps * frames.saturating_sub(1);
+        let info = json!({
+            "version": env!("CARGO_PKG_VERSION"), "made_by": MADE_BY, "capture": to_text(&self.root),
+            "capture_name": self.facts["name"], ELSEWHERE: self.facts[ELSEWHERE], "motion": "followed",
+            "seed": self.recipe.run.seed, "frames": frames, "iteration": steps, "seconds": seconds,
+            "gaussians": self.state.as_ref().map_or(0, |s| s.history.layer.params.len()),
+            "finished": finished, "peak_memory": peak_memory(),
+        });
+        write_atomically(&self.run.join("run.json"), format!("{info:#}\n").as_bytes())
+    }
+}
+
+/// The file of what is followed.
+fn read_plan(file: &Path) -> Result<Value> {
+    serde_json::from_str(&read_text(file)?).map_err(|e| {
+        Error::input(format!("it is not JSON: {e}")).at(file.display()).remedy("Follow the capture into another folder")
+    })
+}
+
+/// Errors: settings that a followed capture cannot have.
+fn check(recipe: &Recipe) -> Result<()> {
+    recipe.check()?;
+    let refined = recipe.refine.poses || recipe.refine.focal || recipe.refine.times;
+    let other = !recipe.run.motion.is_auto() && recipe.run.motion != crate::methods::still::NAME;
+    let (what, remedy) = if other && recipe.run.motion != "spacetime" {
+        (format!("motion `{}`", recipe.run.motion), "Leave option `motion` out: Gaussians move from frame to frame.")
+    } else if refined {
+        ("cameras that are refined".to_owned(), "Refine them on an earlier capture of the same rig.")
+    } else if recipe.capture.observe < 1.0 {
+        ("an unobserved future (option `observe`)".to_owned(), "Leave option `observe` out.")
+    } else {
+        return Ok(());
+    };
+    Err(Error::new(crate::ErrorKind::Unsupported, format!("a capture cannot be followed with {what}")).remedy(remedy))
+}
