@@ -3,7 +3,7 @@
 /// Device that renders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Device {
-    /// A GPU if there is one, otherwise the CPU
+    /// A GPU if there is one that is no slower than the CPU, otherwise the CPU
     Auto,
     /// The CPU
     Cpu,

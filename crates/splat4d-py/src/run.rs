@@ -71,7 +71,7 @@ impl Run {
 
     /// Renders the held-out views, compares them with their images, writes `results.json`, `per_view.json`, the renders
     /// and the report, and returns the means. `lpips_weights`: a .safetensors file; without it LPIPS is not computed.
-    #[pyo3(signature = (*, device="cpu", lpips_weights=None))]
+    #[pyo3(signature = (*, device="auto", lpips_weights=None))]
     fn evaluate(&self, py: Python<'_>, device: &str, lpips_weights: Option<PathBuf>) -> PyResult<Py<PyAny>> {
         let measure = Measure { lpips_weights, device: named(device)? };
         workflows::run(py, |listener, stop| evaluating::evaluate(&self.path, &measure, stop, listener))?;
@@ -89,7 +89,7 @@ impl Run {
     /// `max_mb` limits the file's size in megabytes. `prune` is the share of the Gaussians to remove. `guard` is the largest
     /// loss of training views in dB. `settings` change those of the level: `rounds=3`. Ctrl-C stops with a checkpoint.
     #[pyo3(signature = (out=None, *, level=2, prune=None, max_mb=None, fine_tune=None, guard=GUARD, unpruned=false,
-        evaluate=true, force=false, device="cpu", **settings))]
+        evaluate=true, force=false, device="auto", **settings))]
     #[allow(clippy::too_many_arguments)]
     fn compress(
         &self,

@@ -518,7 +518,7 @@ impl Scene {
     #[pyo3(signature = (
         path, *, route=None, size=None, start=None, end=None, freeze=None, slow_motion=None, seconds=None, fps=None,
         channel="color", shutter=None, aperture=None, focus=None, samples=None, projection="perspective", stereo=None,
-        eye_distance=None, transparent=false, transfer=None, force=false, device="cpu"
+        eye_distance=None, transparent=false, transfer=None, force=false, device="auto"
     ))]
     #[allow(clippy::too_many_arguments)]
     fn film(

@@ -13,6 +13,7 @@ use pyo3::types::{PyBool, PyDict};
 use splat4d::Result;
 use splat4d_train::event::Event;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_workflow::evaluating::Measure;
 use splat4d_workflow::events as workflow;
 use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
 use std::borrow::Cow;
@@ -33,7 +34,7 @@ use std::sync::atomic::AtomicBool;
 /// `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (
-    capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="cpu", evaluate=false,
+    capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="auto", evaluate=false,
     force=false, **settings
 ))]
 #[allow(clippy::too_many_arguments)]
@@ -81,6 +82,7 @@ pub(crate) fn train(
         force,
         minutes,
         device: named(device)?,
+        measure: Measure { device: named(device)?, ..Measure::default() },
         finish: finish(evaluate),
         command: "train (Python)",
         ..TrainingOptions::default()
@@ -96,7 +98,7 @@ fn finish(evaluate: bool) -> Finish {
 /// Continues the run in a folder from its newest checkpoint. A run that started with a `loss` or a `Motion` needs it
 /// again.
 #[pyfunction]
-#[pyo3(signature = (run, *, motion=None, progress=None, loss=None, device="cpu", evaluate=false))]
+#[pyo3(signature = (run, *, motion=None, progress=None, loss=None, device="auto", evaluate=false))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn resume(
     py: Python<'_>,
@@ -113,6 +115,7 @@ pub(crate) fn resume(
     };
     let options = TrainingOptions {
         device: named(device)?,
+        measure: Measure { device: named(device)?, ..Measure::default() },
         finish: finish(evaluate),
         command: "resume (Python)",
         ..TrainingOptions::default()

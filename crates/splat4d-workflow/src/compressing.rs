@@ -4,6 +4,7 @@
 use crate::activity::Activity;
 use crate::adopting::{self, OnCapture};
 use crate::baking;
+use crate::device::chosen;
 use crate::draw::{Channel, Painter, antialias};
 use crate::evaluating::{self, Measure};
 use crate::events::{Listener, Recorded};
@@ -122,7 +123,7 @@ impl Default for CompressOptions {
             set: Vec::new(),
             eval: true,
             size: SIZE,
-            device: Device::Cpu,
+            device: Device::Auto,
             measure: Measure::default(),
         }
     }
@@ -178,9 +179,12 @@ impl CompressOptions {
 /// ```
 pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
     options.measure.check()?;
-    let work = Work::begin(run, options, listener)?.on(options.device).timed_at(options.size);
+    let work = Work::begin(run, options, listener)?.on(chosen(options.device, DOES, listener)).timed_at(options.size);
     work.run(options.eval, &options.measure, stop, listener)
 }
+
+/// What the device does.
+const DOES: &str = "fine-tuning";
 
 /// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure`
 /// count.
@@ -188,7 +192,7 @@ pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listen
 /// Errors: the folder contains no compression; those of [`compress()`].
 pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
     options.measure.check()?;
-    let work = Work::reopen(dir)?.on(options.device).timed_at(options.size);
+    let work = Work::reopen(dir)?.on(chosen(options.device, DOES, listener)).timed_at(options.size);
     work.run(options.eval, &options.measure, stop, listener)
 }
 

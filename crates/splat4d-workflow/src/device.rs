@@ -16,6 +16,11 @@ fn no_gpu() -> bool {
     cfg!(all(feature = "gpu", target_os = "linux")) && !LINUX_GPUS.iter().any(|p| std::path::Path::new(p).exists())
 }
 
+/// The device, or the CPU where there is certainly no GPU for `auto`.
+pub(crate) fn present(device: Device) -> Device {
+    if device == Device::Auto && no_gpu() { Device::Cpu } else { device }
+}
+
 /// The device that does something; where there is certainly no GPU for `auto`, that is reported here.
 pub fn chosen(device: Device, does: &str, listener: &dyn Listener) -> Device {
     if device == Device::Auto && no_gpu() {

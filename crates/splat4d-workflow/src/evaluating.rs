@@ -3,6 +3,7 @@
 
 use crate::baking::{Baking, bake_into};
 use crate::deadline::{Deadline, unless_stopped};
+use crate::device::present;
 use crate::draw::{Channel, Painter};
 use crate::events::Listener;
 use crate::files::{self, human_seconds};
@@ -427,7 +428,7 @@ impl Measuring<'_> {
             place,
             align: Align::of(capture, self.recipe),
             exposures_of: Some(self.opened.path.clone()),
-            device: self.measure.device,
+            device: present(self.measure.device),
             ..EvalOptions::default()
         };
         let iteration = self.opened.iteration().unwrap_or(0);

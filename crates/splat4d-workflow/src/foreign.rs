@@ -1,6 +1,7 @@
 //! Any scene, of a run or of another program, scored on the views of a capture.
 
 use crate::adopting::OnCapture;
+use crate::device::present;
 use crate::evaluating::{Measure, on_backgrounds, print_split};
 use crate::events::Listener;
 use crate::source::{Source, not_empty};
@@ -123,7 +124,7 @@ fn foreign_scores(
             train_views: 0,
             measured,
             place: (!name.is_empty()).then(|| format!("{}-{name}", measured.name())),
-            device: measure.device,
+            device: present(measure.device),
             ..EvalOptions::default()
         };
         let mut listen = |event: &Event| console.event(event);

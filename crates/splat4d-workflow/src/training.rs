@@ -88,7 +88,7 @@ impl Default for TrainingOptions {
             predict: false,
             chunk: None,
             grow: true,
-            device: Device::Cpu,
+            device: Device::Auto,
             measure: Measure::default(),
             finish: Finish::default(),
             clock: Stopwatch::start(),

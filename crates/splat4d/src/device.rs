@@ -1,21 +1,24 @@
 //! Selects the rendering device: a suitable GPU if there is one, otherwise the CPU; and reports why.
 
+mod probe;
 mod resident;
 #[cfg(test)]
 mod tests;
 
 pub use resident::ResidentMotion;
 
+#[cfg(not(feature = "gpu"))]
+use crate::ErrorKind;
 #[cfg(feature = "gpu")]
 use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
-use crate::math::{Rng, Se3, sym3};
 use crate::render::{
     Abilities, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables,
     Target,
 };
-use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
-use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
-use crate::{Error, ErrorKind, Result};
+use crate::scene::Table;
+use crate::{Error, Result};
+#[cfg(feature = "gpu")]
+use probe::Work;
 
 /// The name of the CPU as a device.
 const CPU: &str = "the CPU";
@@ -23,7 +26,8 @@ const CPU: &str = "the CPU";
 /// The choice of a device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Device {
-    /// The GPU if there is one, else the CPU; never a driver that computes on the CPU.
+    /// The GPU if there is one that passes a self-test and is no slower than the CPU, else the CPU; never a driver that
+    /// computes on the CPU.
     Auto,
     /// The CPU.
     #[default]
@@ -225,62 +229,6 @@ impl Backend for WithCpu {
     }
 }
 
-/// Splats of the self-test.
-const TEST_SPLATS: usize = 200;
-/// Width and height of its image: no whole tiles.
-const TEST_SIZE: [usize; 2] = [75, 45];
-/// Largest difference of a channel, and of a gradient as a share of its length, at which a device is trusted: far above
-/// roundings and a splat at the α cut-off, far below any mistake.
-const TRUSTED: [f64; 2] = [0.02, 0.05];
-
-/// Renders a small scene and runs the backward pass, as the CPU does. Errors: the results differ.
-#[cfg_attr(not(feature = "gpu"), allow(dead_code))]
-fn trusted(backend: &mut dyn Backend) -> Result<()> {
-    let rng = Rng::new(1, "self-test", 0);
-    let (mut out, mut colors) = (Table::new(&SPLAT_COLUMNS, TEST_SPLATS), Table::new(&[("rgb", 3)], TEST_SPLATS));
-    for j in 0..TEST_SPLATS {
-        let r = rng.fork(j as u64);
-        out.write::<3>(j, 0, std::array::from_fn(|k| 2.0 * r.uniform(k as u64) as f32 - 1.0));
-        let turn: [f32; 4] = std::array::from_fn(|k| r.normal(10 + k as u64) as f32);
-        out.write(
-            j,
-            COV,
-            sym3::from_quat_log_scales(turn, std::array::from_fn(|k| r.normal(20 + k as u64) as f32 - 2.5)),
-        );
-        out.set(j, SPLAT_OPACITY, r.uniform(4) as f32);
-        colors.write::<3>(j, 0, std::array::from_fn(|k| r.uniform(30 + k as u64) as f32));
-    }
-    let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
-    let pose = Se3::look_at([0.0, 0.5, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
-    let camera = Camera::with_fov_y(pose, 0.6, TEST_SIZE[0], TEST_SIZE[1]);
-    let shot = Shot::new(&splats, &camera, [0.2, 0.5, 0.8]);
-    let mut pull = Planes::new(3, TEST_SIZE[1], TEST_SIZE[0]);
-    pull.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) as f32);
-    let grads = ImageGrads { color: &pull, alpha: None, depth: None, extra: None };
-    let through = |backend: &mut dyn Backend| -> Result<(Image, Table)> {
-        let (mut image, mut d) = (Image::default(), RenderGrads::default());
-        backend.render(&shot, &mut image)?;
-        backend.vjp(&shot, &grads, &mut [None], &mut d)?;
-        Ok((image, d.parts.swap_remove(0).out))
-    };
-    let (config, (image, d)) = (*backend.config(), through(backend)?);
-    let (expected, d_expected) = through(cpu(config).as_mut())?;
-    let off = |(a, b): (&f32, &f32)| f64::from(a - b);
-    // NaN is no less than anything.
-    let same = image.color.data.iter().zip(&expected.color.data).map(off).all(|v| v.abs() < TRUSTED[0]);
-    let square = |v: f64| v * v;
-    let apart: f64 = d.data().iter().zip(d_expected.data()).map(off).map(square).sum();
-    let length: f64 = d_expected.data().iter().map(|v| square(f64::from(*v))).sum();
-    if same && (apart / length).sqrt() < TRUSTED[1] {
-        return Ok(());
-    }
-    Err(Error::new(
-        ErrorKind::Unsupported,
-        "the GPU's driver fails a self-test: its image or its gradients differ from the CPU's",
-    )
-    .remedy("Update the driver, or use the CPU."))
-}
-
 #[cfg(not(feature = "gpu"))]
 fn gpu(_: Device, _: RenderConfig, _: &Abilities, _: Tables) -> Result<(Box<dyn Backend>, String)> {
     Err(Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`"))
@@ -296,13 +244,12 @@ fn gpu(
     // Cheap, where opening a driver takes a moment. The CPU is chosen without the advice to choose it.
     GpuRenderer::refuses(abilities).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
-    let open = || Gpu::open(adapters);
-    if abilities.backward {
-        return to_train(&open, config, tables, &mut trusted);
+    let work = if abilities.backward { Work::Step } else { Work::Image };
+    let (mut renderer, name) = tested(&|| Gpu::open(adapters), config, work, &mut |gpu| work.trusted(gpu))?;
+    if device == Device::Auto {
+        work.slower_once(&mut renderer).map_err(|e| e.at(&name))?;
     }
-    let gpu = open()?;
-    let name = gpu.describe();
-    let mut renderer = GpuRenderer::new(gpu, config)?;
+    renderer.forget_scene();
     renderer.tables = tables;
     Ok((Box::new(renderer), name))
 }
@@ -314,19 +261,20 @@ type SelfTest<'a> = &'a mut dyn FnMut(&mut dyn Backend) -> Result<()>;
 /// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither;
 /// that of the first is reported.
 #[cfg(feature = "gpu")]
-fn to_train(
+fn tested(
     open: &dyn Fn() -> Result<Gpu>,
     config: RenderConfig,
-    tables: Tables,
+    work: Work,
     test: SelfTest<'_>,
-) -> Result<(Box<dyn Backend>, String)> {
-    let mut tested = |gpu: Gpu| -> Result<(Box<dyn Backend>, String)> {
+) -> Result<(GpuRenderer, String)> {
+    let mut tested = |gpu: Gpu| -> Result<(GpuRenderer, String)> {
         let name = gpu.describe();
         let mut renderer = GpuRenderer::new(gpu, config)?;
-        renderer.tables = tables;
-        renderer.for_training()?;
+        if work == Work::Step {
+            renderer.for_training()?;
+        }
         test(&mut renderer).map_err(|e| e.at(&name))?;
-        Ok((Box::new(renderer), name))
+        Ok((renderer, name))
     };
     tested(open()?).or_else(|error| {
         // Subgroups are the newest part of drivers.

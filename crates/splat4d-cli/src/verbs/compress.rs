@@ -84,7 +84,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<[usize; 2]>,
     /// Device that renders during fine-tuning; the CPU does the rest
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
+    #[arg(long, value_enum, default_value = "auto", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: MeasureArgs,
@@ -96,7 +96,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Some(dir) => Work::reopen(dir)?,
         None => Work::begin(args.run.as_ref().expect("clap requires a run"), &options(args), console)?,
     };
-    let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "training", console));
+    let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "fine-tuning", console));
     let stop = interrupt::flag("stopping");
     work.run(!args.no_eval, &args.measure.options(), &stop, console)?;
     Ok(())

@@ -112,7 +112,7 @@ pub(crate) struct Args {
           help_heading = "Evaluation")]
     truth: Option<PathBuf>,
     /// Device that renders the views; the CPU computes the metrics
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
+    #[arg(long, value_enum, default_value = "auto", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: MeasureArgs,

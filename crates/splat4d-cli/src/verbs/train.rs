@@ -12,6 +12,7 @@ use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::settings::{Setting, nearest};
 use splat4d_workflow::chunked::ChunkSelection;
+use splat4d_workflow::evaluating::Measure;
 use splat4d_workflow::files::{self, parse_bytes};
 use splat4d_workflow::parts::left_out;
 use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
@@ -33,7 +34,7 @@ Examples:
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train concert -o runs/concert --chunk-frames 60    a long capture in chunks
   splat4d train s3://takes/concert -o s3://takes/run --chunk all    workers on object storage
-  splat4d train my-take --device auto               on a GPU, if there is one
+  splat4d train my-take --device cpu                not on the GPU
   splat4d train --resume runs/first                 continue exactly
 
 A capture is a folder with one of these: capture.json (write it for your own rig), transforms_train.json (D-NeRF, \
@@ -133,8 +134,8 @@ pub struct Args {
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     memory_limit: Option<u64>,
     /// Device to train on. The CPU runs whatever the GPU does not support. Not part of the recipe: a run can be resumed
-    /// on another device
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
+    /// on another device; with auto, a run of the CPU stays on it
+    #[arg(long, value_enum, default_value = "auto", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: MeasureArgs,
@@ -189,7 +190,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         predict: args.quality.is_some(),
         chunk: args.chunk,
         device: args.device.into(),
-        measure: args.measure.options(),
+        measure: Measure { device: args.device.into(), ..args.measure.options() },
         finish: if args.no_eval { Finish::Playback } else { Finish::All },
         clock: control.clock(),
         ..TrainingOptions::default()

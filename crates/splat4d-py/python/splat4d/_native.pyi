@@ -248,7 +248,7 @@ class Scene:
         transparent: bool = False,
         transfer: Literal["linear", "srgb"] | None = None,
         force: bool = False,
-        device: _Device = "cpu",
+        device: _Device = "auto",
     ) -> None: ...
     def localise(self, images: Sequence[_Path], *, start: _Path | None = None, lens: bool = False) -> list[dict[str, Any]]: ...
     def edit(self, edits: str | _Path) -> Scene: ...
@@ -328,7 +328,7 @@ class Run:
     def results(self) -> dict[str, Any] | None: ...
     def scene(self) -> Scene: ...
     def status(self) -> dict[str, Any]: ...
-    def evaluate(self, *, device: _Device = "cpu", lpips_weights: _Path | None = None) -> dict[str, Any]: ...
+    def evaluate(self, *, device: _Device = "auto", lpips_weights: _Path | None = None) -> dict[str, Any]: ...
     def report(self) -> Any: ...
     def compress(
         self,
@@ -342,7 +342,7 @@ class Run:
         unpruned: bool = False,
         evaluate: bool = True,
         force: bool = False,
-        device: _Device = "cpu",
+        device: _Device = "auto",
         **settings: Any,
     ) -> Run: ...
     def label(self, capture: _Path | None = None, *, rounds: int | None = None) -> None: ...
@@ -395,7 +395,7 @@ def train(
     loss: _Loss | None = None,
     minutes: float | None = None,
     quality: Literal["draft", "standard", "best"] | None = None,
-    device: _Device = "cpu",
+    device: _Device = "auto",
     evaluate: bool = False,
     force: bool = False,
     **settings: Any,
@@ -406,7 +406,7 @@ def resume(
     motion: Motion | None = None,
     progress: _Progress | Literal[False] | None = None,
     loss: _Loss | None = None,
-    device: _Device = "cpu",
+    device: _Device = "auto",
     evaluate: bool = False,
 ) -> Run: ...
 def command(*words: _Path) -> list[dict[str, Any]]: ...

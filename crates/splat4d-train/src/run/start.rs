@@ -21,6 +21,9 @@ use crate::init::Seeds;
 use crate::path_text::of_text;
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
+use serde_json::Value;
+use splat4d::device::{self, Device};
+use splat4d::render::RenderConfig;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -225,7 +228,7 @@ pub fn resume_with(
             .at(run.display())
             .remedy(format!("Continue it with `splat4d {other}` and the options it began with")));
     }
-    let opened = OpenCapture::new(Arc::new(capture), &recipe)?.on(options.device);
+    let opened = OpenCapture::new(Arc::new(capture), &recipe)?.on(same_device(options.device, &info));
     // As it was settled at the start.
     let (opened, _) = aligned(opened, &recipe)?;
     let (opened, _) = priors::believed(opened, &recipe)?;
@@ -250,6 +253,12 @@ pub fn resume_with(
     let mut listen = listen;
     let state = session.restore(&mut trainer, &mut listen)?;
     session.drive(&mut trainer, state, &mut listen)
+}
+
+/// The device to continue a run on: `auto` keeps the CPU, and with it the bits of an uninterrupted run.
+fn same_device(device: Device, info: &Value) -> Device {
+    let on_cpu = info["device"].as_str() == Some(device::cpu(RenderConfig::default()).name());
+    if device == Device::Auto && on_cpu { Device::Cpu } else { device }
 }
 
 /// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture is

@@ -1,11 +1,14 @@
 //! Every backend against the oracle through the trait, refusals, and the way from a device that fails to the CPU.
 
+use super::probe::Work;
 use super::*;
-use crate::math::Real;
+use crate::ErrorKind;
+use crate::math::{Real, Rng, Se3, sym3};
 use crate::render::backend::refusal;
 use crate::render::{ImageGrads, Oracle, RenderGrads};
 use crate::scene::head::{HIDDEN, INPUTS};
-use crate::scene::{HeadWeights, Rows};
+use crate::scene::splats::SPLAT_COLUMNS;
+use crate::scene::{Camera, Color, HeadWeights, Part, Planes, Rows, Splats};
 
 fn view() -> Camera {
     Camera::with_fov_y(Se3::look_at([0.0, 0.0, -1.0], [0.0; 3], [0.0, -1.0, 0.0]), 1.0, 3, 2)
@@ -172,10 +175,24 @@ fn a_device_with_wrong_results_is_not_used() {
         ([f32::NAN, 0.0], false),
         ([0.0, f32::NAN], false),
     ] {
-        let said = trusted(&mut Crooked(Renderer::new(RenderConfig::default()), faults));
+        let said = Work::Step.trusted(&mut Crooked(Renderer::new(RenderConfig::default()), faults));
         assert_eq!(said.is_ok(), good, "{faults:?}: {said:?}");
         assert!(said.is_ok() || said.is_err_and(|e| e.to_string().contains("self-test")));
+        // Gradients do not count where there is no backward pass.
+        let rendered = Work::Image.trusted(&mut Crooked(Renderer::new(RenderConfig::default()), faults));
+        assert_eq!(rendered.is_ok(), faults[0].abs() < 0.01, "{faults:?}: {rendered:?}");
     }
+}
+
+#[test]
+fn auto_prefers_the_cpu_to_a_slower_device() {
+    assert!(Work::Step.compared([0.004, 0.004]).is_ok());
+    let slower = Work::Step.compared([0.0123, 0.0045]).expect_err("the CPU is faster").to_string();
+    assert_eq!(slower, "it takes 12.3 ms for a test step, the CPU 4.5 ms");
+    // A device that fails is not used either.
+    let mut failing = Failing { renderer: Renderer::new(RenderConfig::default()), drawn: 0, going_back: false };
+    let failed = Work::Image.slower(&mut failing).expect_err("its driver is gone").to_string();
+    assert!(failed.contains("the driver is gone"), "{failed}");
 }
 
 #[test]
@@ -199,10 +216,11 @@ fn a_driver_that_fails_the_self_test_is_tried_without_subgroups_and_left_then() 
         let mut attempts = 0;
         let mut test = |backend: &mut dyn Backend| {
             attempts += 1;
-            if attempts > bad { trusted(backend) } else { Err(wrong().at(attempts)) }
+            if attempts > bad { Work::Step.trusted(backend) } else { Err(wrong().at(attempts)) }
         };
-        let came = to_train(&open, config, Tables::Changing, &mut test);
-        (attempts, or_cpu(config, came))
+        let came = tested(&open, config, Work::Step, &mut test);
+        let boxed = came.map(|(gpu, name)| (Box::new(gpu) as Box<dyn Backend>, name));
+        (attempts, or_cpu(config, boxed))
     };
     for (bad, expected) in [(0, &whole), (1, &portable)] {
         let (attempts, opened) = tried(bad);

@@ -170,6 +170,12 @@ impl GpuRenderer {
         self.buffers.bytes() + self.upload.bytes() + self.pictures.bytes() + tables
     }
 
+    /// Forgets every table that was sent, and frees its memory.
+    pub(crate) fn forget_scene(&mut self) {
+        self.upload = Upload::default();
+        self.drawn.clear();
+    }
+
     /// Refuses what the shaders cannot do, without opening a GPU.
     pub(crate) fn refuses(abilities: &Abilities) -> Result<()> {
         let lacks = [(abilities.head, "render scenes with a pixel head"), (abilities.extra, "blend further channels")];

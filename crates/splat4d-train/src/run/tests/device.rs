@@ -37,7 +37,18 @@ fn a_run_reports_its_device_and_where_it_resumes() {
     // A run on the CPU, as all were, states nothing.
     let mut silent = |event: &Event| assert!(!matches!(event, Event::Device { .. }));
     let (run, options) = (place.run("cpu"), TrainOptions::default());
-    train(place.open(&recipe), recipe, &run, &options, &AtomicBool::new(false), &mut silent).unwrap();
+    train(place.open(&recipe), recipe.clone(), &run, &options, &AtomicBool::new(false), &mut silent).unwrap();
+    // Nor does one that `auto` continues: it stays on the CPU.
+    let (run, stop) = (place.run("auto"), AtomicBool::new(false));
+    let mut halfway = |event: &Event| {
+        if let Event::Checkpoint { iteration: 10, .. } = event {
+            stop.store(true, Ordering::Relaxed);
+        }
+    };
+    train(place.open(&recipe), recipe, &run, &options, &stop, &mut halfway).unwrap();
+    let options = TrainOptions { device: Device::Auto, ..TrainOptions::default() };
+    resume_with(&run, &options, &AtomicBool::new(false), &mut silent).unwrap();
+    assert!(place.scene("auto") == place.scene("cpu"));
 }
 
 #[test]
