@@ -398,6 +398,7 @@ def train(
     device: _Device = "cpu",
     evaluate: bool = False,
     force: bool = False,
+    follow: bool = False,
     **settings: Any,
 ) -> Run: ...
 def resume(
