@@ -29,6 +29,7 @@ const GUIDES = [
   ['docs/choose-model', 'Choose a motion model'],
   ['docs/gpu', 'Use a GPU'],
   ['docs/scale', 'Train long captures'],
+  ['docs/follow', 'Train while filming'],
   ['docs/refine', 'Refine cameras, localise images'],
   ['docs/shutters', 'Rolling shutter, blur, exposure'],
   ['docs/priors', 'Add depth, flow, tracks'],

@@ -11,6 +11,7 @@
 //! | `deformation.rs`, `lifting.rs` | synthetic motion with known truth |
 //! | `made/` | synthetic captures, each hard for one reason |
 //! | `e00.rs`, `e01.rs`, `e02.rs`, `e03.rs`, `models.rs` | the studies; `e02/` is the ablation of the filter |
+//! | `replay.rs` | a capture that is recorded again while it is trained (docs/follow.md) |
 //! | `suite/` | the recipe on a list of captures (docs/suite.md) |
 //! | `best.rs` | the page of the best figures (docs/best.md) |
 //! | `bench.rs`, `bench/` | pinned scenes, stages, training steps, growth, GPU stages, playback, other programs (`other_programs/with_gsplat.py`); each time with its lower bound (docs/benchmarks.md) |
@@ -26,6 +27,7 @@ mod e03;
 mod lifting;
 mod made;
 mod models;
+mod replay;
 mod study;
 mod suite;
 mod tables;
@@ -42,6 +44,7 @@ Examples:
   studies e03 runs/knight              how much can be pruned, by which score, and what does the filter cost?
   studies e03 runs/knight --quick
   studies models examples/knight       every motion model, three minutes each
+  studies replay examples/knight       how much does training frame by frame lose?
   studies suite --data sets            the recipe on captures of every kind
   studies bench                        speed of this machine, stage by stage
   studies best                         the best figure of every capture and model, next to published ones
@@ -66,6 +69,7 @@ enum Study {
     E02(e02::Args),
     E03(e03::Args),
     Models(models::Args),
+    Replay(replay::Args),
     Suite(suite::Args),
     Bench(Box<bench::Args>),
     Best(best::Args),
@@ -85,6 +89,7 @@ fn main() -> ExitCode {
             Study::E02(args) => e02::run(&args, console),
             Study::E03(args) => e03::run(&args, console),
             Study::Models(args) => models::run(&args, console),
+            Study::Replay(args) => replay::run(&args, console),
             Study::Suite(args) => suite::run(&args, console),
             Study::Bench(args) => bench::run(&args, threads, console),
             Study::Best(args) => best::run(&args, console),

@@ -7,6 +7,7 @@ use splat4d_train::output::{self, Owner};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::corrected;
+use splat4d_train::run::follow::{self, Following};
 use splat4d_workflow::run_folder::{Run, RunRequest};
 use std::cell::OnceCell;
 use std::path::Path;
@@ -19,6 +20,8 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "per_view_json", seeds: || vec![PER_VIEW.into()], read: |b| open("per_view.json", b) },
     Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
     Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
+    Reader { name: "follow_plan", seeds: || vec![FOLLOW.into()], read: |b| open("frames/follow.json", b) },
+    Reader { name: "follow_frame", seeds: || vec![follow::example_frame()], read: |b| drop(follow::check_frame(b)) },
     Reader { name: "compress_json", seeds: || vec![COMPRESS.into()], read: |b| open("compress.json", b) },
     Reader { name: "geometry_json", seeds: || vec![GEOMETRY.into()], read: |b| open("geometry.json", b) },
     Reader { name: "refined_json", seeds: || vec![REFINED.into()], read: |b| open("refined.json", b) },
@@ -35,6 +38,7 @@ const PER_VIEW: &str =
 const CAMERAS: &str = r#"[{"id": 0, "img_name": "a", "width": 8, "height": 6, "position": [0, 0, -4],
     "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 8, "fy": 8, "cx": 4, "cy": 3, "near": 0.1, "time": 0.5, "split": "test"}]"#;
 const PLAN: &str = r#"{"version": "0.1.0", "recipe": "0011223344556677", "capture": "8899", "take": [0, 120], "overlap": 16, "cuts": [60]}"#;
+const FOLLOW: &str = r#"{"version": "0.1.0", "capture": "/nowhere", "recipe": "0011223344556677"}"#;
 const FILES: &str = "run.json\ntest/ours_10/\ntest/ours_10/renders/00000.png\nü%0a.json\n";
 
 const COMPRESS: &str = r#"{"bytes": 1000, "before": {"PSNR": 20.5}, "after": {"PSNR": 20.0}, "tiers": []}"#;
@@ -68,6 +72,7 @@ fn open(file: &str, bytes: &[u8]) {
             drop((run.name(), run.iteration(), run.scene_file(), run.views()));
         }
         drop((corrected::read(run), Owner::holder(run)));
+        drop(Following::request(run));
         drop((Chunked::open(run).map(|c| c.parts()), RunRequest::unbegun(run), output::written(run)));
         std::fs::remove_file(path).expect("it is there");
     });
@@ -75,11 +80,13 @@ fn open(file: &str, bytes: &[u8]) {
 
 fn made() -> TempDir {
     let folder = tempfile::tempdir().expect("there is a place for temporary files");
-    for inner in ["chunks", ".splat4d"] {
+    for inner in ["chunks", "frames", ".splat4d"] {
         std::fs::create_dir(folder.path().join(inner)).expect("it is new");
     }
     // Short: it is parsed for every input, and the reader `recipe` has inputs of its own.
-    std::fs::write(folder.path().join("recipe.toml"), "[run]\niterations = 10\n").expect("the disk takes a file");
+    for recipe in ["recipe.toml", "frames/recipe.toml"] {
+        std::fs::write(folder.path().join(recipe), "[run]\niterations = 10\n").expect("the disk takes a file");
+    }
     folder
 }
 
@@ -98,6 +105,7 @@ mod tests {
             ("per_view.json", PER_VIEW.into()),
             ("cameras.json", CAMERAS.into()),
             ("chunks/plan.json", PLAN.into()),
+            ("frames/follow.json", FOLLOW.into()),
             (".splat4d/files", FILES.into()),
             (".splat4d/asked", asked()),
         ] {
@@ -106,6 +114,8 @@ mod tests {
         let run = Run::open(at).unwrap();
         assert_eq!((run.metrics.len(), run.views.len(), run.views().unwrap().len()), (1, 1, 1));
         assert_eq!((run.name().as_str(), output::written(at).len()), ("a", 4));
+        assert_eq!(Following::request(at).unwrap().0, Path::new("/nowhere"));
+        follow::check_frame(&follow::example_frame()).unwrap();
         assert!(RunRequest::unbegun(at).is_some());
         assert!(Chunked::open(at).err().unwrap().to_string().contains("recipe"), "its fingerprint is another");
     }

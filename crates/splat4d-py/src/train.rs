@@ -13,8 +13,10 @@ use pyo3::types::{PyBool, PyDict};
 use splat4d::Result;
 use splat4d_train::event::Event;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_train::run::follow::Following;
 use splat4d_workflow::evaluating::Measure;
 use splat4d_workflow::events as workflow;
+use splat4d_workflow::following;
 use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -30,12 +32,13 @@ use std::sync::atomic::AtomicBool;
 /// and returns (value, gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays
 /// have half of the size, with `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file,
 /// measure held-out views, film an orbit and write the report, as the command does; `minutes` includes it. `force`
-/// replaces a run that is in `out` already. Ctrl-C, or an exception in a function of yours, stops with a checkpoint;
+/// replaces a run that is in `out` already. `follow` trains the capture while it is being filmed, frame by frame
+/// (docs/follow.md); its settings are those of the table `follow`, `follow__timeout=10`. Ctrl-C, or an exception in a function of yours, stops with a checkpoint;
 /// `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (
     capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="auto", evaluate=false,
-    force=false, **settings
+    force=false, follow=false, **settings
 ))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train(
@@ -50,6 +53,7 @@ pub(crate) fn train(
     device: &str,
     evaluate: bool,
     force: bool,
+    follow: bool,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<Run> {
     let mut recipe = Recipe::default().with(|r| r.run.motion = MotionName::AUTO);
@@ -88,7 +92,10 @@ pub(crate) fn train(
         ..TrainingOptions::default()
     };
     let listener = Listener::new(py, progress, loss, raised)?;
-    listener.drive(py, options, |options, stop, listen| training::train(&path, &recipe, options, stop, listen))
+    listener.drive(py, options, |options, stop, listen| match follow {
+        true => following::follow(&path, &recipe, options, stop, listen),
+        false => training::train(&path, &recipe, options, stop, listen),
+    })
 }
 
 fn finish(evaluate: bool) -> Finish {
@@ -122,7 +129,10 @@ pub(crate) fn resume(
     };
     let raised = motion.map(Hook::register).transpose()?.map_or_else(Arc::default, |hook| hook.raised.clone());
     let listener = Listener::new(py, progress, loss, raised)?;
-    listener.drive(py, options, |options, stop, listen| training::resume(&path, options, stop, listen))
+    listener.drive(py, options, |options, stop, listen| match Following::is(&path) {
+        true => following::resume(&path, options, stop, listen),
+        false => training::resume(&path, options, stop, listen),
+    })
 }
 
 /// Listeners of a run, which may end it.

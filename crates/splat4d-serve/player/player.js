@@ -174,6 +174,7 @@ export class Player extends EventTarget {
       ]);
       if (run !== this.#run) return file.close();
       this.#adopt(file, { keep, start });
+      file.watch(() => this.load(source, { keep: true }));
       if (!keep) this.#poster(file, run);
       // What is there plays; that it is not all is an error all the same.
       if (file.truncated) this.emit('trouble', { error: cutShort(file, source), lasting: true });

@@ -36,6 +36,8 @@ const MAX_POSTER = 32 << 20;
 /// More sound is refused, bytes; and what its bytes 4 to 7 are.
 const MAX_SOUND = 64 << 20,
   MP4 = 'ftyp';
+/// A file that grows is looked at again after this time, ms: its header is 64 bytes.
+const GROWTH = 2000;
 /// Workers: inflating a page takes some ms, and the network is slower than two.
 const WORKERS = (globalThis.navigator?.hardwareConcurrency ?? 2) > 2 ? 2 : 1;
 
@@ -151,6 +153,7 @@ export class SceneFile {
   #where;
   #head;
   #decoder = new Decoder();
+  #timer = 0;
 
   /// Bytes from the network or the disk.
   get bytesRead() {
@@ -225,7 +228,23 @@ export class SceneFile {
     return this.sections.some((s) => s.kind === 'PAGE' && s.missing && s.from <= t && t < s.to);
   }
 
+  /// Calls `more()` whenever a file that grows has become longer by its header, which is read again every `every` ms,
+  /// until the file is closed.
+  watch(more, every = GROWTH) {
+    if (!this.growing) return;
+    this.#timer = setTimeout(async () => {
+      const timer = this.#timer;
+      // Without a connection there is nothing new; it may come back.
+      const head = await this.#source.read(0, HEAD).catch(() => []);
+      if (timer !== this.#timer) return;
+      if (head.length === HEAD && long(new DataView(head.buffer, head.byteOffset), 16) !== this.length) more();
+      if (timer === this.#timer) this.watch(more, every);
+    }, every);
+  }
+
   close() {
+    clearTimeout(this.#timer);
+    this.#timer = 0;
     this.#source.close();
     this.#decoder.close();
   }

@@ -18,6 +18,23 @@ impl Progress<'_> {
     }
 }
 
+/// A frame of a followed capture.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct FollowedFrame {
+    /// Its number.
+    pub frame: usize,
+    /// Its second on the scene clock.
+    pub at: f64,
+    /// Seconds that it took: images read, Gaussians trained, held-out views rendered.
+    pub seconds: f64,
+    /// Gaussians of the scene.
+    pub gaussians: usize,
+    /// Gaussians that the frame replaced or added.
+    pub changed: usize,
+    /// Mean PSNR of its held-out views, dB; none: no camera is held out.
+    pub psnr: Option<f64>,
+}
+
 /// One event. `--json` prints it serialised (with `type`), one per line.
 #[derive(Clone, Debug, serde::Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
@@ -149,6 +166,8 @@ pub enum Event {
         /// Mean PSNR of some held-out views, dB; none: no view is held out.
         held_out: Option<f64>,
     },
+    /// A frame of a capture that is still being filmed is part of the scene.
+    Frame(FollowedFrame),
     /// How far the trained scene is from the capture's measured geometry. `geometry.json` of the run has it by camera.
     Geometry {
         /// Share of the pixels of training images with a measurement.

@@ -31,6 +31,7 @@ use splat4d_train::output::OutputFolder;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
+use splat4d_train::run::follow::Following;
 use splat4d_train::run::{Stopwatch, capture_options, corrected};
 use splat4d_train::{features, labels};
 use std::fmt::Write as _;
@@ -213,8 +214,8 @@ pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
 /// The same, within a time.
 pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> Result<()> {
     // The file of a compression is what was learnt: baking again would lose its codes, palette and masks.
-    // That of a long capture was made chunk by chunk.
-    if run.join(ORDER).is_file() || Chunked::is(run) {
+    // That of a long capture was made chunk by chunk, that of a followed one frame by frame.
+    if run.join(ORDER).is_file() || Chunked::is(run) || Following::is(run) {
         return Ok(());
     }
     let baked = Source::open(run).and_then(|mut source| {

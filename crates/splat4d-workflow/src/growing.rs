@@ -9,14 +9,15 @@ use crate::playable::FILE;
 use crate::run_folder::Run;
 use crate::sound;
 use crate::source::Source;
-use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, finish};
+use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, Sound, finish};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::output::{note, write_atomically_with};
 use splat4d_train::run::chunks::{ChunkPlan, Chunked, Part};
 use std::fs::File;
 use std::io::Read;
-use std::path::Path;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 /// Bytes 8 and 9 of a file that grows: its major version (docs/format.md, "Files that grow").
@@ -178,7 +179,7 @@ fn opened(run: &Path, scene: Scene<f32>) -> Result<Source> {
     Ok(Source { run: Some(Run::open(run)?), ..Source::own(scene) })
 }
 
-fn union(a: Option<[[f64; 3]; 2]>, b: Option<[[f64; 3]; 2]>) -> Option<[[f64; 3]; 2]> {
+pub(crate) fn union(a: Option<[[f64; 3]; 2]>, b: Option<[[f64; 3]; 2]>) -> Option<[[f64; 3]; 2]> {
     let (Some([a0, a1]), Some([b0, b1])) = (a, b) else { return a.or(b) };
     Some([std::array::from_fn(|k| a0[k].min(b0[k])), std::array::from_fn(|k| a1[k].max(b1[k]))])
 }
@@ -201,6 +202,70 @@ fn missing(plan: &ChunkPlan, meta: &Meta) -> Vec<[f64; 2]> {
     }
     out.retain(|span| span[0] < meta.clip[1]);
     out
+}
+
+/// The playback file of a capture that is followed while it is being filmed. Its parts are named by their frames.
+pub(crate) struct Film {
+    path: PathBuf,
+    file: Growing<File>,
+    /// Metadata of the whole; clip and box are those of what is in it.
+    pub(crate) about: Meta,
+}
+
+impl Film {
+    /// Continues the file, or begins it where there is none that can be continued, or one with frames from `end` on.
+    pub(crate) fn open(path: &Path, about: Meta, end: usize) -> Result<Self> {
+        let place = |e: std::io::Error| Error::io("the playback file cannot be opened", e).at(path.display());
+        let options = || {
+            let mut options = File::options();
+            options.read(true).write(true);
+            options
+        };
+        let known = options().open(path).ok().and_then(|file| Growing::open(file).ok());
+        let file = match known.filter(|file| last_frame(&file.index().meta).is_none_or(|last| last <= end)) {
+            Some(file) => file,
+            None => {
+                note(path)?;
+                let file = options().create(true).truncate(true).open(path).map_err(place)?;
+                Growing::begin(file, Meta { clip: [about.clip[0]; 2], gaussians: 0, ..about.clone() })?
+            }
+        };
+        let bounds = union(about.bounds, file.index().meta.bounds);
+        Ok(Self { path: path.to_owned(), file, about: Meta { bounds, ..about } })
+    }
+
+    /// Its name.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The frame after the last one in it, from `first` on.
+    pub(crate) fn frames(&self, first: usize) -> usize {
+        last_frame(&self.file.index().meta).map_or(first, |last| last.max(first))
+    }
+
+    /// Appends a part. After an error the file is what it was.
+    pub(crate) fn append(&mut self, part: &[u8], frames: Range<usize>, meta: Meta) -> Result<()> {
+        let mut parts = self.file.index().meta.parts.clone();
+        parts.push(format!("{}..{}", frames.start, frames.end));
+        self.about.bounds = meta.bounds;
+        let meta = Meta { parts, ..meta };
+        self.file.append(part, meta, &mut |f| f.sync_data()).map_err(|e| e.at(self.path.display()))
+    }
+
+    /// Its present content as a finished file.
+    pub(crate) fn finished(&self, (poster, sound): (Option<&[u8]>, Option<&Sound>)) -> Result<Vec<u8>> {
+        let mut source = files::open(&self.path)?;
+        let mut bytes = Vec::new();
+        let meta = self.file.index().meta.clone();
+        finish(&mut source, meta, (poster, sound), &mut bytes).map_err(|e| e.at(self.path.display()))?;
+        Ok(bytes)
+    }
+}
+
+/// The frame after the last one that the parts of a followed capture name.
+fn last_frame(meta: &Meta) -> Option<usize> {
+    meta.parts.iter().filter_map(|name| name.split_once("..")?.1.parse().ok()).max()
 }
 
 /// Metadata of the run's scene, whatever parts of it there are.

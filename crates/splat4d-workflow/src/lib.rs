@@ -50,6 +50,7 @@
 //! | `evaluating.rs`, `adopting.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; a scene of another program as a run; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
+//! | `following.rs` | captures that are still being filmed |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
 //! | `storage/` | captures and runs on object storage |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
@@ -84,6 +85,7 @@ pub mod events;
 pub mod exporting;
 pub mod files;
 pub mod folding;
+pub mod following;
 pub mod foreign;
 pub mod growing;
 #[cfg(feature = "import")]

@@ -14,6 +14,7 @@ use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Ow
 use splat4d_train::path_text::{in_command, of_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
+use splat4d_train::run::follow::Following;
 use splat4d_train::run::{capture_options, checkpoint, recorded_elsewhere};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -456,6 +457,9 @@ pub struct RunRequest {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
+    /// Whether the capture is followed while it grows.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    follow: bool,
     /// Files that the capture reads from elsewhere.
     #[serde(skip)]
     elsewhere: BTreeSet<PathBuf>,
@@ -465,12 +469,17 @@ impl RunRequest {
     pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
         let (version, recipe) = (env!("CARGO_PKG_VERSION").into(), recipe.to_toml());
-        Self { version, capture, recipe, minutes, predict, elsewhere: BTreeSet::new() }
+        Self { version, capture, recipe, minutes, predict, follow: false, elsewhere: BTreeSet::new() }
     }
 
     /// The same of an opened capture; what it reads from elsewhere holds no output either.
     pub fn of(capture: &Capture, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         Self { elsewhere: capture.elsewhere.clone(), ..Self::new(&capture.root, recipe, minutes, predict) }
+    }
+
+    /// The same, for a capture that is followed while it grows.
+    pub fn followed(self) -> Self {
+        Self { follow: true, ..self }
     }
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
@@ -491,7 +500,7 @@ impl RunRequest {
         let inputs: Vec<Input<'_>> = origin.inputs().collect();
         let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(run, &request)?;
-        if found == FolderContent::Unfinished && checkpoint::list(run).is_empty() {
+        if found == FolderContent::Unfinished && checkpoint::list(run).is_empty() && !Following::is(run) {
             folder.clear()?;
             return Ok((folder, FolderContent::Nothing));
         }

@@ -10,10 +10,12 @@ use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
+use splat4d_train::run::follow::Following;
 use splat4d_train::settings::{Setting, nearest};
 use splat4d_workflow::chunked::ChunkSelection;
 use splat4d_workflow::evaluating::Measure;
 use splat4d_workflow::files::{self, parse_bytes};
+use splat4d_workflow::following;
 use splat4d_workflow::parts::left_out;
 use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
 use std::path::{Path, PathBuf};
@@ -33,6 +35,7 @@ Examples:
   splat4d train my-take --motion still              a static scene: checks the calibration
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train concert -o runs/concert --chunk-frames 60    a long capture in chunks
+  splat4d train live-take --follow --view           while it is being filmed
   splat4d train s3://takes/concert -o s3://takes/run --chunk all    workers on object storage
   splat4d train my-take --device cpu                not on the GPU
   splat4d train --resume runs/first                 continue exactly
@@ -69,7 +72,7 @@ pub struct Args {
     output: Option<PathBuf>,
     /// Continue this run from its newest checkpoint
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
-        "downscale", "hold_out", "images", "poses", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
+        "downscale", "hold_out", "images", "poses", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force", "follow"])]
     resume: Option<PathBuf>,
     /// Replace the run in the -o folder (only files that splat4d wrote) once the new run has begun
     #[arg(long)]
@@ -125,6 +128,13 @@ pub struct Args {
     /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
     #[arg(long, value_name = "PART", help_heading = "Long captures", requires = "output", conflicts_with = "force")]
     chunk: Option<ChunkSelection>,
+    /// Train the capture while it is being filmed, frame by frame as its images arrive. Only Gaussians whose pixels change
+    /// learn, and the playback file grows. Ends with the file `capture.end` in its folder, or after --follow-timeout
+    #[arg(long, help_heading = "Live captures", conflicts_with_all = ["minutes", "chunk", "chunk_frames", "observe", "quality"])]
+    follow: bool,
+    /// Seconds without a complete frame after which the capture counts as finished [default: 60]
+    #[arg(long, value_name = "SECONDS", help_heading = "Live captures", requires = "follow")]
+    follow_timeout: Option<f64>,
     #[command(flatten, next_help_heading = "Long captures")]
     storage: StorageArgs,
     /// Memory for decoded images [default: 1GiB]
@@ -206,14 +216,24 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         }
         Some(run) => {
             let options = TrainingOptions { command: RESUME, ..options };
-            training::resume(run, &options, &stop, &watched)?
+            match Following::is(run) {
+                true => following::resume(run, &options, &stop, &watched)?,
+                false => training::resume(run, &options, &stop, &watched)?,
+            }
         }
         None => {
             let source = source.expect("clap requires a capture");
             let recipe = recipe(args)?;
             let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
             recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
-            if on_storage {
+            if args.follow && on_storage {
+                return Err(Error::input("--follow needs a local capture and a local run")
+                    .remedy("Copy the images to a local folder while they are recorded.")
+                    .into());
+            }
+            if args.follow {
+                following::follow(source, &recipe, &options, &stop, &watched)?
+            } else if on_storage {
                 train_on_storage(args, source, &recipe, &options, &stop, &watched)?
             } else {
                 training::train(source, &recipe, &options, &stop, &watched)?
@@ -227,10 +247,11 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .into());
     }
     if trained.interrupted {
+        let what = if Following::is(run) { "following" } else { "training" };
         let resume = format!("splat4d train --resume {}", in_command(run));
         watched.stopped(trained.iteration.unwrap_or(0), &resume);
         let after = trained.iteration.map_or_else(String::new, |n| format!(" after step {n}"));
-        return Err(Error::new(ErrorKind::Interrupted, format!("training was stopped{after} and saved"))
+        return Err(Error::new(ErrorKind::Interrupted, format!("{what} was stopped{after} and saved"))
             .remedy(format!("Continue with: {resume}"))
             .into());
     }
@@ -309,6 +330,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     set("image_memory", args.image_memory.map(|v| v.to_string()))?;
     set("memory_limit", args.memory_limit.map(|v| v.to_string()))?;
     set("iterations", args.iterations.map(|v| v.to_string()))?;
+    set("follow.timeout", args.follow_timeout.map(|v| v.to_string()))?;
     set("max_cap", args.max_cap.map(|v| v.to_string()))?;
     set("sh_degree", args.sh_degree.map(|v| v.to_string()))?;
     for assignment in &args.set {

@@ -398,6 +398,7 @@ def train(
     device: _Device = "auto",
     evaluate: bool = False,
     force: bool = False,
+    follow: bool = False,
     **settings: Any,
 ) -> Run: ...
 def resume(

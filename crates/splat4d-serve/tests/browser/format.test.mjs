@@ -206,6 +206,30 @@ test('a file that grows has its index behind its sections, and reads like a fini
   await assert.rejects(SceneFile.open(growing.subarray(0, growing.length - 1)), /truncated in its index/);
 });
 
+test('a file that grows is looked at again until it is closed', async () => {
+  const growing = grown(sample().bytes),
+    longer = Buffer.concat([growing, Buffer.alloc(64)]);
+  longer.writeBigUInt64LE(BigInt(longer.length), 16);
+  let now = growing,
+    calls = 0;
+  // A source that is replaced: a Blob's slices are read when they are requested.
+  const source = Object.assign(new Blob([growing]), { slice: (a, b) => new Blob([now.subarray(a, b)]) });
+  const file = await SceneFile.open(source);
+  const called = new Promise((done) => file.watch(() => (calls++, done()), 5));
+  await new Promise((done) => setTimeout(done, 40));
+  assert.equal(calls, 0, 'it has not grown yet');
+  now = longer;
+  await called;
+  file.close();
+  const before = calls;
+  await new Promise((done) => setTimeout(done, 40));
+  assert.equal(calls, before, 'a closed file is left alone');
+  const finished = await SceneFile.open(sample().bytes);
+  finished.watch(() => assert.fail('a finished file does not grow'), 1);
+  await new Promise((done) => setTimeout(done, 20));
+  finished.close();
+});
+
 test('hostile and foreign files are refused with a message', async () => {
   const base = sample().json,
     PAGE = (more) => ({

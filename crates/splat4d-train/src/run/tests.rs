@@ -107,6 +107,11 @@ impl Place {
         self.runs.path().join(name)
     }
 
+    /// The capture's folder.
+    pub(crate) fn source(&self) -> &Path {
+        self.capture.path()
+    }
+
     pub(crate) fn open(&self, recipe: &Recipe) -> Arc<Capture> {
         Arc::new(open_capture(self.capture.path(), recipe).unwrap())
     }

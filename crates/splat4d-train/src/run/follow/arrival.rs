@@ -26,8 +26,11 @@ pub enum Arrival {
         /// Whether some files of the frame are there.
         begun: bool,
     },
-    /// It will never come: the capture states that it has ended.
-    Ended,
+    /// It will never be complete: the capture states that it has ended.
+    Ended {
+        /// What is left out, a clause; none: nothing.
+        left: Option<String>,
+    },
 }
 
 /// A file as it was seen last.
@@ -58,8 +61,9 @@ impl Watch {
             // It may be replaced at this moment.
             Err(e) => return Ok(Arrival::Incomplete { what: e.to_string(), begun: false }),
         };
-        if files.stated.is_some_and(|count| frame >= count) {
-            return Ok(Arrival::Ended);
+        if let Some(count) = files.stated.filter(|count| frame >= *count) {
+            let left = format!("capture.json states {count} frames, and {frame} were followed before");
+            return Ok(Arrival::Ended { left: (frame > count).then_some(left) });
         }
         let (mut missing, mut begun) = (Vec::new(), false);
         for (camera, paths) in &files.cameras {
@@ -75,10 +79,11 @@ impl Watch {
             }
         }
         if let Some(first) = missing.first() {
-            if root.join(END_MARKER).is_file() {
-                return Ok(if begun { incomplete(first, missing.len(), true) } else { Arrival::Ended });
-            }
-            return Ok(incomplete(first, missing.len(), begun));
+            let what = counted(first, missing.len());
+            return Ok(match root.join(END_MARKER).is_file() {
+                true => Arrival::Ended { left: begun.then_some(what) },
+                false => Arrival::Incomplete { what, begun },
+            });
         }
         let all: Vec<PathBuf> = files.cameras.iter().flat_map(|(_, paths)| paths.iter().flatten().cloned()).collect();
         self.seen.retain(|path, _| all.contains(path));
@@ -86,7 +91,7 @@ impl Watch {
         self.seen = all.into_iter().zip(looks).collect();
         let unready: Vec<String> = self.seen.iter().filter(|(_, look)| look.decoded.is_none()).map(unready).collect();
         if let Some(first) = unready.first() {
-            return Ok(incomplete(first, unready.len(), true));
+            return Ok(Arrival::Incomplete { what: counted(first, unready.len()), begun: true });
         }
         self.check_sizes(&files.cameras)?;
         Ok(Arrival::Complete)
@@ -151,7 +156,8 @@ fn unready((path, look): (&PathBuf, &Look)) -> String {
     }
 }
 
-fn incomplete(first: &str, count: usize, begun: bool) -> Arrival {
+/// The first of some findings, and how many others there are.
+fn counted(first: &str, count: usize) -> String {
     let others = if count > 1 { format!(" (and {} more)", count - 1) } else { String::new() };
-    Arrival::Incomplete { what: format!("{first}{others}"), begun }
+    format!("{first}{others}")
 }

@@ -24,7 +24,7 @@ use super::info::{ELSEWHERE, elsewhere, read_text};
 use super::open::{OpenCapture, capture_options, open_frames};
 use super::{peak_memory, points};
 use crate::capture::{Capture, CaptureOptions, Lenses, growing_root};
-use crate::event::Event;
+use crate::event::{Event, FollowedFrame};
 use crate::path_text::{of_text, to_text};
 use crate::recipe::Recipe;
 use crate::{Error, Result};
@@ -46,25 +46,12 @@ use std::time::Instant;
 const FOLDER: &str = "frames";
 /// The file in it that states what is followed.
 const PLAN: &str = "follow.json";
+/// The recipe, in the run and as it was requested in the folder of the frames.
+const RECIPE: &str = "recipe.toml";
 /// The verb that made the run.
 const MADE_BY: &str = "train --follow";
-
-/// What a frame became.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FollowedFrame {
-    /// Its number.
-    pub frame: usize,
-    /// Its time, seconds.
-    pub time: f64,
-    /// Seconds that it took, images read and compared.
-    pub seconds: f64,
-    /// Gaussians of the scene.
-    pub gaussians: usize,
-    /// Gaussians that were replaced or added.
-    pub changed: usize,
-    /// Mean PSNR of its held-out views, dB; none: no camera is held out.
-    pub psnr: Option<f64>,
-}
+/// The motion model of the pages of a playback file, which become the run's scene.
+const PLAYED: &str = "spacetime";
 
 /// A capture that is followed into a run folder.
 pub struct Following {
@@ -109,7 +96,10 @@ impl Following {
                     .remedy("Use the same command, or another folder"));
             }
         } else {
-            write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+            // That of the run states later what became of it.
+            for at in [run.to_owned(), run.join(FOLDER)] {
+                write_atomically(&at.join(RECIPE), recipe.to_toml().as_bytes())?;
+            }
             write_atomically(&file, format!("{plan:#}\n").as_bytes())?;
         }
         let mut following = Self {
@@ -136,11 +126,15 @@ impl Following {
         run.join(FOLDER).join(PLAN).is_file()
     }
 
+    /// Number of frames that a run has finished.
+    pub fn frames(run: &Path) -> usize {
+        record::list(&run.join(FOLDER)).len()
+    }
+
     /// The capture and the recipe of a run, to [`begin`](Self::begin) it again. Errors: it is none, or damaged.
     pub fn request(run: &Path) -> Result<(PathBuf, Recipe)> {
         let plan = read_plan(&run.join(FOLDER).join(PLAN))?;
-        let file = run.join(FOLDER).join("recipe.toml");
-        let file = if file.is_file() { file } else { run.join("recipe.toml") };
+        let file = run.join(FOLDER).join(RECIPE);
         let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
         let capture = plan["capture"].as_str().map(of_text).ok_or_else(|| {
             Error::input("it does not name its capture")
@@ -178,7 +172,7 @@ impl Following {
     pub fn look(&mut self, frame: usize) -> Result<Arrival> {
         let most = self.recipe.capture.max_frames;
         if most > 0 && frame >= self.first().saturating_add(most) {
-            return Ok(Arrival::Ended);
+            return Ok(Arrival::Ended { left: None });
         }
         self.watch.look(&self.root, frame, &self.options)
     }
@@ -222,8 +216,10 @@ impl Following {
         let changed = record.params.len();
         self.apply(&record);
         let (gaussians, psnr) = self.score(&capture)?;
-        let (time, seconds) = (self.seconds(frame), began.elapsed().as_secs_f64());
-        Ok(Some(FollowedFrame { frame, time, seconds, gaussians, changed, psnr }))
+        let (at, seconds) = (self.seconds(frame), began.elapsed().as_secs_f64());
+        let done = FollowedFrame { frame, at, seconds, gaussians, changed, psnr };
+        listen(&Event::Frame(done.clone()));
+        Ok(Some(done))
     }
 
     /// The first frame: as a static scene from the capture's points.
@@ -422,18 +418,12 @@ impl Following {
     /// Writes what makes the folder a run on the frames that were followed: `recipe.toml` and `run.json`.
     /// `finished`: whether all is done.
     pub fn write_info(&self, seconds: f64, finished: bool) -> Result<()> {
-        let folder = self.folder();
-        let own = folder.join("recipe.toml");
-        if !own.is_file() {
-            // The one that the command gave: that of the run states what became of it.
-            write_atomically(&own, read_text(&self.run.join("recipe.toml"))?.as_bytes())?;
-        }
         let frames = self.next - self.first();
         let recipe = self.recipe.clone().with(|r| {
             r.capture.max_frames = frames.max(1);
-            r.run.motion = crate::recipe::MotionName::of(crate::methods::still::NAME);
+            r.run.motion = crate::recipe::MotionName::of(PLAYED);
         });
-        write_atomically(&self.run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
+        write_atomically(&self.run.join(RECIPE), recipe.to_toml().as_bytes())?;
         let follow = &self.recipe.follow;
         let steps = follow.first_steps + follow.frame_steps * frames.saturating_sub(1);
         let info = json!({
@@ -445,6 +435,20 @@ impl Following {
         });
         write_atomically(&self.run.join("run.json"), format!("{info:#}\n").as_bytes())
     }
+}
+
+/// Checks the file of a frame, whatever run it is of. Errors: it is damaged.
+#[doc(hidden)]
+pub fn check_frame(bytes: &[u8]) -> Result<()> {
+    Record::parse(bytes, 0).map(drop)
+}
+
+/// The file of a small frame.
+#[doc(hidden)]
+pub fn example_frame() -> Vec<u8> {
+    let params = splat4d::scene::Params::new(2, 1, &[]);
+    let record = Record { frame: 0, active: vec![0], params, origin: vec![0, history::NEW], ..Record::default() };
+    record.bytes().expect("memory takes it")
 }
 
 /// The file of what is followed.
@@ -459,7 +463,7 @@ fn check(recipe: &Recipe) -> Result<()> {
     recipe.check()?;
     let refined = recipe.refine.poses || recipe.refine.focal || recipe.refine.times;
     let other = !recipe.run.motion.is_auto() && recipe.run.motion != crate::methods::still::NAME;
-    let (what, remedy) = if other && recipe.run.motion != "spacetime" {
+    let (what, remedy) = if other && recipe.run.motion != PLAYED {
         (format!("motion `{}`", recipe.run.motion), "Leave option `motion` out: Gaussians move from frame to frame.")
     } else if refined {
         ("cameras that are refined".to_owned(), "Refine them on an earlier capture of the same rig.")

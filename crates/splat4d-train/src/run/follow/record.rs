@@ -18,7 +18,7 @@ const VERSION: u64 = 1;
 const ENDING: &str = "safetensors";
 
 /// Changes of a frame.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Record {
     /// Its number.
     pub frame: usize,
@@ -53,6 +53,11 @@ pub(super) fn list(folder: &Path) -> Vec<usize> {
 impl Record {
     /// Writes its file.
     pub(super) fn write(&self, folder: &Path) -> Result<()> {
+        write_atomically(&path(folder, self.frame), &self.bytes()?)
+    }
+
+    /// The bytes of its file.
+    pub(super) fn bytes(&self) -> Result<Vec<u8>> {
         let (n, k) = (self.params.len(), self.params[SH].width());
         let geometry = self.params[GEOMETRY].column_to_rows(0, ROW);
         let sh = self.params[SH].column_to_rows(0, k);
@@ -67,7 +72,7 @@ impl Record {
         let facts = json!({"version": VERSION, "frame": self.frame, "facts": self.facts});
         let mut bytes = Vec::new();
         safetensors::write(&tensors, &BTreeMap::from([(KEY.to_owned(), facts.to_string())]), &mut bytes)?;
-        write_atomically(&path(folder, self.frame), &bytes)
+        Ok(bytes)
     }
 
     /// Reads the file of a frame. Errors: it is damaged or of another version.
@@ -78,7 +83,7 @@ impl Record {
         Self::parse(&bytes, frame).map_err(|e| e.at(path.display()).remedy(remedy))
     }
 
-    fn parse(bytes: &[u8], frame: usize) -> Result<Self> {
+    pub(super) fn parse(bytes: &[u8], frame: usize) -> Result<Self> {
         let broken = |what: &str| Error::input(format!("the file of a followed frame is damaged: {what}"));
         let file = SafeTensors::read(bytes)?;
         let text = file.metadata().get(KEY).ok_or_else(|| broken("it has no metadata"))?;
