@@ -35,6 +35,8 @@ pub(crate) const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
 pub(crate) const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
 /// The same with pixels in vectors. After `SUBGROUP_SUMS`.
 pub(crate) const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
+/// The same with a lane per splat. After `BLEND_BACK`.
+pub(crate) const RASTERIZE_BACK_LANES: &str = include_str!("gpu/rasterize_back_lanes.wgsl");
 /// The blend's backward pass: a record a (tile, splat) pair. After `BLEND_BACK`.
 pub(crate) const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
@@ -87,15 +89,16 @@ mod tests {
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
     /// Those that need more than WebGPU's core.
-    const SUBGROUPS: [&str; 3] = [
+    const SUBGROUPS: [&str; 4] = [
         "rasterize, backward, with subgroups",
         "sort with subgroups",
         "rasterize, backward, with subgroups and vectors",
+        "rasterize, backward, with a lane per splat",
     ];
 
     #[test]
     fn every_shader_is_valid_within_webgpus_default_limits() {
-        let shaders: [(&str, &[&str]); 28] = [
+        let shaders: [(&str, &[&str]); 29] = [
             ("project and shade", &[PROJECT, SHADE]),
             ("sort", &[SORT]),
             ("splats", &[PROJECT, SHADE, SPLATS]),
@@ -107,6 +110,7 @@ mod tests {
             ("rasterize, backward", &[PROJECT, BLEND_BACK, RASTERIZE_BACK]),
             (SUBGROUPS[0], &[PROJECT, BLEND_BACK, SUBGROUP_SUMS, RASTERIZE_BACK_SUBGROUP]),
             (SUBGROUPS[2], &[PROJECT, BLEND_BACK, SUBGROUP_SUMS, RASTERIZE_BACK_VECTOR]),
+            (SUBGROUPS[3], &[PROJECT, BLEND_BACK, RASTERIZE_BACK_LANES]),
             (SUBGROUPS[1], &[SORT, SORT_SUBGROUP]),
             ("record", &[RECORD]),
             ("bytes", &[PROJECT, BYTES]),

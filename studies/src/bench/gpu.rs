@@ -96,6 +96,8 @@ const LISTS: [&str; 6] = ["project", "compact", "sort splats", "tiles", "sort pa
 const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
 /// A whole training step; a frame of a film.
 const STEP: &str = "step";
+/// The CPU's part of it: what the caller of a step waits for while the GPU is behind.
+const HOST: &str = "step, on the CPU";
 const FILM: &str = "frame, nothing read back";
 /// Frames of a film, times the rounds, of which there are five by default; and how often it is rendered at most: the
 /// best counts.
@@ -235,7 +237,7 @@ fn steps(
 ) -> Result<Vec<Row>> {
     let mut trainer = training::trainer_on(pinned.scene.clone(), held.clone(), Box::new(renderer))?;
     let mut seen = vec![[f64::MAX; OF_STEPS.len()]; pinned.views.len()];
-    let mut step = f64::MAX;
+    let (mut step, mut host) = (f64::MAX, f64::MAX);
     for round in 0..=way.rounds {
         for _ in 0..seen.len() {
             training::step(&mut trainer)?;
@@ -250,8 +252,10 @@ fn steps(
         for _ in 0..seen.len() {
             training::step(&mut trainer)?;
         }
+        let begun = clock.elapsed();
         training::catch_up(&mut trainer)?;
         if round > 0 {
+            host = host.min(1e3 * begun.as_secs_f64() / seen.len() as f64);
             step = step.min(1e3 * clock.elapsed().as_secs_f64() / seen.len() as f64);
         }
     }
@@ -282,6 +286,7 @@ fn steps(
     let mut rows: Vec<Row> = OF_STEPS.iter().enumerate().map(of_stage).collect();
     let floor = floor_of(drawn, &[&LISTS[..], &BACKWARD].concat()) + floor_of(&rows, &OF_STEPS);
     rows.push(Row { ceiling_share: Some(floor / step), ..row(STEP, step) });
+    rows.push(row(HOST, host));
     Ok(rows)
 }
 
@@ -354,14 +359,14 @@ mod tests {
                 return println!("skipped: {e}");
             }
         };
-        let all = [&STAGES[..], &OF_STEPS, &[STEP]].concat();
+        let all = [&STAGES[..], &OF_STEPS, &[STEP, HOST]].concat();
         let (films, others): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.stage == FILM);
         assert!(films.len() == 1 && films[0].tuning.is_none(), "one film, at the defaults");
         let stages: Vec<&str> = others.iter().map(|r| r.stage.as_str()).collect();
         assert_eq!(stages, all.repeat(tunings.len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
-            assert!(row.ceiling_share.is_some_and(|share| share > 0.0), "{row:?}");
+            assert!(row.stage == HOST || row.ceiling_share.is_some_and(|share| share > 0.0), "{row:?}");
             assert_eq!(row.tuning.is_some(), row.against.is_some(), "{row:?}");
         }
         let ms = |stage: &str| rows.iter().find(|r| r.stage == stage).expect("it is there").ms;

@@ -37,7 +37,7 @@ pub(super) struct Held {
     cameras: Vec<Camera>,
     times: Vec<Time>,
     pictures: Vec<Planes<f32>>,
-    /// The one that was loaded last.
+    /// The one that was in the last step.
     last: AtomicUsize,
 }
 
@@ -66,7 +66,7 @@ impl Held {
         }
     }
 
-    /// The image that was loaded last.
+    /// The image that was in the last step.
     pub(super) fn last(&self) -> usize {
         self.last.load(Ordering::Relaxed)
     }
@@ -82,7 +82,9 @@ impl Frames for Held {
         self.pictures.len()
     }
 
+    /// Steps read the camera of every frame, and load only images that no device keeps.
     fn camera(&self, i: usize) -> &Camera {
+        self.last.store(i, Ordering::Relaxed);
         &self.cameras[i]
     }
 
@@ -99,7 +101,6 @@ impl Frames for Held {
     }
 
     fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
-        self.last.store(i, Ordering::Relaxed);
         out.color.clone_from(&self.pictures[i]);
         (out.mask, out.weight) = (None, None);
         Ok(())

@@ -93,6 +93,8 @@ pub struct TrainContext {
     pub batch_size: usize,
     /// Share of the steps, from the first, that use images at half size.
     pub half_size_until: f64,
+    /// Bytes of images that a device keeps; 0: a share of its free memory.
+    pub device_images: u64,
     /// Whether the end of the clip is kept from training, to be predicted.
     pub predicted: bool,
     /// 1.1 times the largest distance of a camera from the cameras' centroid, scene units (Kerbl et al. 2023).

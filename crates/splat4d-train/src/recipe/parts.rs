@@ -87,6 +87,7 @@ impl Recipe {
             iterations: r.run.iterations,
             batch_size: r.run.batch_size,
             half_size_until: r.run.half_size_until,
+            device_images: r.run.device_images,
             predicted: r.capture.observe < 1.0,
             shell: r.init.shell_at(),
             common: operations! { tables common {} {} },

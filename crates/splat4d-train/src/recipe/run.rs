@@ -25,6 +25,9 @@ settings! {
         checkpoint_interval: usize = 0 => any().unit("iterations");
         /// Bytes of decoded images in memory.
         image_memory: u64 = 1 << 30 => any().unit("bytes");
+        /// Bytes of images that a GPU keeps; others are sent in every step. 0: 60 % of a graphics card's free memory, at
+        /// least 1 GiB; 2 GiB where the GPU shares the CPU's memory.
+        device_images: u64 = 0 => any().unit("bytes");
         /// Memory limit of training; 0: no limit. Checked before the start, then enforced by the cap.
         memory_limit: u64 = 0 => any().unit("bytes");
     }

@@ -15,6 +15,7 @@ pub(super) fn recipe_print(recipe: &Recipe, text: &str) -> String {
     // Settings of memory alone never affect a result and may change between resumes.
     let neutral = recipe.clone().with(|r| {
         r.run.image_memory = 0;
+        r.run.device_images = 0;
         r.run.memory_limit = 0;
         r.run.checkpoint_interval = 0;
         // Checkpoints hold what they followed of it.

@@ -305,6 +305,7 @@ impl OpenCapture {
         let config = RenderConfig {
             antialias: if c.appearance.antialias { Antialias::On } else { Antialias::Off },
             simd: self.simd,
+            device_images: plan.device_images,
             ..RenderConfig::default()
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();

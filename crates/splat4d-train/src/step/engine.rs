@@ -71,6 +71,8 @@ pub struct Stepped {
     pub change: Change,
     /// A message for the user about the rendering device.
     pub notices: Vec<String>,
+    /// Whether nothing was done, because images are needed that were left out as a device held them ([`Engine::holds`]).
+    pub needs_images: bool,
 }
 
 /// Cause of an invalid step.
@@ -106,6 +108,12 @@ pub trait Engine: Send {
     /// Errors: they are lost.
     fn settle(&mut self, _learner: &mut TrainState) -> Result<Vec<Measured>, Fault> {
         Ok(Vec::new())
+    }
+
+    /// Whether a step needs only the shape of a frame's truth and weights, in this size (width, height): a device took the
+    /// last step, and keeps them.
+    fn holds(&mut self, _frame: usize, _size: [usize; 2], _weighted: bool) -> bool {
+        false
     }
 
     /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps reports them.

@@ -1,6 +1,7 @@
 //! [`DeviceEngine`]: steps on a device that keeps the tables, where a stage lets it; all others are the CPU's, with
 //! whatever renders.
 
+use super::batch::left_out;
 use super::chain::ImageTerm;
 use super::engine::{
     Blame, CpuEngine, Engine, Fault, Measured, Rates, StepPlan, Stepped, exposure_rate, noise_rate, noise_stream,
@@ -13,8 +14,8 @@ use crate::{ErrorKind, Result};
 use splat4d::device::ResidentMotion;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
-    Antialias, Backend, KEPT, Moves, ResidentCameras, ResidentLayer, ResidentNoise, ResidentRule, ResidentStep,
-    ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights, Target,
+    Antialias, Backend, KEPT, Moves, Resident, ResidentCameras, ResidentLayer, ResidentNoise, ResidentRule,
+    ResidentStep, ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Key, LIFE, LifeKind};
@@ -56,6 +57,10 @@ pub(crate) struct DeviceEngine<'a> {
     under_way: VecDeque<InFlight>,
     /// Measurements of finished steps, not reported yet.
     ready: Vec<Measured>,
+    /// Whether the last step was the device's.
+    took: bool,
+    /// Messages that are not reported yet.
+    notices: Vec<String>,
 }
 
 impl<'a> DeviceEngine<'a> {
@@ -71,6 +76,8 @@ impl<'a> DeviceEngine<'a> {
             known: Vec::new(),
             under_way: VecDeque::new(),
             ready: Vec::new(),
+            took: false,
+            notices: Vec::new(),
         }
     }
 
@@ -88,6 +95,11 @@ impl<'a> DeviceEngine<'a> {
         plan: &mut StepPlan<'_>,
         notices: Vec<String>,
     ) -> Result<Result<Stepped, Fault>> {
+        self.took = false;
+        if plan.views.iter().any(left_out) {
+            self.notices = notices;
+            return Ok(Ok(Stepped { needs_images: true, ..Stepped::default() }));
+        }
         let before = match self.settle(train_state) {
             Ok(measured) => measured,
             Err(fault) => return Ok(Err(fault)),
@@ -267,7 +279,7 @@ fn rules(
 
 impl Engine for DeviceEngine<'_> {
     fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
-        let mut notices = Vec::new();
+        let mut notices = std::mem::take(&mut self.notices);
         if self.given_up || self.cpu.backend().resident().is_none() {
             return self.step_on_cpu(train_state, plan, notices);
         }
@@ -341,7 +353,7 @@ impl Engine for DeviceEngine<'_> {
                 return self.step_on_cpu(train_state, plan, notices);
             }
         };
-        self.newest = Newest::Device;
+        (self.newest, self.took) = (Newest::Device, true);
         self.under_way.push_back(InFlight {
             iteration: plan.info.iteration + 1,
             dssim: views.iter().map(|v| v.target.dssim).collect(),
@@ -407,6 +419,11 @@ impl Engine for DeviceEngine<'_> {
         // The reader may change something, statistics too.
         self.newest = Newest::TrainState;
         Ok(measured)
+    }
+
+    fn holds(&mut self, frame: usize, size: [usize; 2], weighted: bool) -> bool {
+        let keeps = |resident: &mut dyn Resident| resident.holds(frame, size, weighted);
+        self.took && !self.given_up && self.cpu.backend().resident().is_some_and(keeps)
     }
 
     fn stages(&mut self) -> Vec<(&'static str, f64)> {

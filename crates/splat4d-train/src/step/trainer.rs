@@ -140,12 +140,14 @@ impl<'a> Trainer<'a> {
     /// Lets some pixels weigh more from now on.
     pub(crate) fn emphasise(&mut self, emphasis: Option<Emphasis>) {
         self.batch.emphasis = emphasis;
+        self.batch.forget();
     }
 
     /// Uses other frames, of the same times, from now on.
     #[cfg(test)]
     pub(crate) fn set_frames(&mut self, frames: Arc<dyn Frames>) {
         self.frames = frames;
+        self.batch.forget();
     }
 
     /// Steps of the run in all.
@@ -200,6 +202,7 @@ impl<'a> Trainer<'a> {
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
     pub(crate) fn restore(&mut self, train_state: TrainState, progress: Position) {
         (self.train_state, self.progress, self.entered) = (train_state, progress, progress.rests);
+        self.batch.forget();
         self.spread();
     }
 
@@ -262,6 +265,8 @@ impl<'a> Trainer<'a> {
         self.progress.stage += 1;
         (self.progress.stage_step, self.progress.taken, self.progress.rests) = (0, 0, false);
         self.entered = false;
+        // Its losses may need more than the images.
+        self.batch.forget();
         Ok(())
     }
 
@@ -299,10 +304,17 @@ impl<'a> Trainer<'a> {
         let clock = Clock::now();
         self.load()?;
         let load = clock.elapsed();
-        let mut out = match self.learn()? {
+        let mut learnt = self.learn()?;
+        if learnt.as_ref().is_ok_and(|stepped| stepped.needs_images) {
+            self.batch.forget();
+            self.load()?;
+            learnt = self.learn()?;
+        }
+        let mut out = match learnt {
             Ok(stepped) => Stepped { load, ..stepped },
             Err(fault) => return Ok(Err(self.named(fault))),
         };
+        self.batch.remember(&mut |frame, size, weighted| self.engine.holds(frame, size, weighted));
         self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
@@ -373,15 +385,20 @@ impl<'a> Trainer<'a> {
         let (Position { taken, stage_step: place, .. }, next) = (self.progress, self.next_place());
         let stage = &self.stages[self.progress.stage];
         let corrections = self.train_state.corrections.as_ref();
+        let frames = self.draw_frames(taken, place);
         self.batch.load(
             self.frames.as_ref(),
-            self.draw_frames(taken, place),
+            frames,
             place < stage.half_size_steps,
             corrections,
             Rng::new(self.settings.seed, "tracks", self.progress.iteration as u64),
+            &mut |frame, size, weighted| self.engine.holds(frame, size, weighted),
         )?;
         if next < stage.iterations {
-            self.frames.prefetch(&self.draw_frames(taken + 1, next));
+            let half = next < stage.half_size_steps;
+            let mut frames = self.draw_frames(taken + 1, next);
+            frames.retain(|&frame| !self.batch.is_kept(frame, half));
+            self.frames.prefetch(&frames);
         }
         Ok(())
     }

@@ -80,6 +80,11 @@ impl GpuRenderer {
         // Lists may grow by a share more than they need; behind the records are a few sums.
         let room = super::largest_binding(&self.gpu) / (RECORD_BYTES + 1) * SPARE / (SPARE + 1);
         self.most_pairs = self.most_pairs.min(usize::try_from(room).unwrap_or(usize::MAX));
+        if self.gpu.lanes() > 0 {
+            // Half of a binding for states, half for planes.
+            let states = super::largest_binding(&self.gpu) / 2 / super::STATE_BYTES * self.gpu.lanes() as u64;
+            self.most_pairs = self.most_pairs.min((states * SPARE / (SPARE + 1)) as usize);
+        }
         self.compile_back()
     }
 

@@ -1,8 +1,8 @@
-// What both ways back through a tile share: bindings, and one splat at one pixel. Twin of Returning in render/blend.rs,
+// What all ways back through a tile share: bindings, and one splat at one pixel. Twin of Returning in render/blend.rs,
 // which documents the equations. render/project.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile), 3 values, 4 owners, 5 shapes, 6 colors and 7
-// planes as rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9
+// planes as rasterize.wgsl read and wrote them, states behind them; 8 d_planes: gradient to the planes, laid out as they are; out: 9
 // records, twelve numbers a pair, cleared to 0 before, and behind them (at blend.sums_at) three per tile, the gradient
 // to the background. Eight storage buffers.
 //
@@ -31,6 +31,7 @@ struct Blend {
     sums_at: u32, // number of the first sum behind the records
     skipped: u32, // rows of pixels of the planes above the band, and all of theirs
     plane_rows: u32,
+    states_at: u32, // number of the first state behind the planes
 }
 
 @group(0) @binding(0) var<uniform> view: View;

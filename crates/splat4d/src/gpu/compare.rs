@@ -102,7 +102,7 @@ impl GpuRenderer {
         self.timings.upload = start.elapsed().as_secs_f64() * 1e3;
         self.stats = GpuStats { splats: n, bands: 1, ..GpuStats::default() };
         self.for_training()?;
-        let held = self.pictures.hold(&self.gpu, target)?;
+        let held = self.pictures.hold(&self.gpu, target, self.config.device_images)?;
         let came = if held.weight > 0.0 { self.compare_held(shot, target, &held) } else { Ok(None) };
         self.pictures.give_back(held);
         let Some((came, comparison)) = came? else { return Ok(None) };
@@ -149,7 +149,7 @@ impl GpuRenderer {
             if pairs > self.most_pairs {
                 return Ok(None);
             }
-            fresh = self.make_room_for_pairs(pairs)?;
+            fresh = self.make_room_for_pairs(pairs)? | self.make_room_for_band(band, across, size[0])?;
         };
         let mut sums = [0.0; PARTIALS];
         for tile in came.partials[..partials].chunks_exact(PARTIALS) {

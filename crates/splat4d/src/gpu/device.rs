@@ -117,6 +117,11 @@ impl Gpu {
         format!("{} ({:?}, {}, {}{with})", i.name, i.device_type, i.backend, driver.trim())
     }
 
+    /// Whether it has memory that is not the CPU's.
+    pub(super) fn has_own_memory(&self) -> bool {
+        self.info.device_type == wgpu::DeviceType::DiscreteGpu
+    }
+
     /// Whether the GPU's own clock can be read.
     pub(crate) fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
@@ -131,6 +136,12 @@ impl Gpu {
     pub(crate) fn has_subgroups(&self) -> bool {
         let fits = self.info.subgroup_min_size >= SUBGROUPS[0] && self.info.subgroup_max_size <= SUBGROUPS[1];
         self.tuning.subgroups && fits && self.device.features().contains(wgpu::Features::SUBGROUP)
+    }
+
+    /// Splats of a bucket of the backward pass with a lane per splat: the threads of the smallest subgroup, so that a
+    /// workgroup of as many lies in one. 0: the backward pass has another form.
+    pub(super) fn lanes(&self) -> usize {
+        if self.tuning.back_lanes && self.has_subgroups() { self.smallest_subgroup() } else { 0 }
     }
 
     /// Waits until all work has been done.

@@ -4,7 +4,7 @@ use super::MOST_GROUPS;
 use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
-use super::kernels::{BackKernels, Kernel, Kernels};
+use super::kernels::{BACK_WAYS, BackKernels, Kernel, Kernels};
 use super::limits::THREADS;
 use super::upload::{Draw, Upload};
 use wgpu::{BindGroup, BindingResource, ComputePass};
@@ -378,7 +378,8 @@ impl Back<'_> {
         recorder.stage(Stage::RasterizeBack, |pass| {
             pass.set_bind_group(0, &rasterize, &[]);
             pass.set_pipeline(&k.rasterize.pipelines[0]);
-            pass.dispatch_workgroups(across as u32, band.rows as u32, 1);
+            let ways = if gpu.lanes() > 0 { BACK_WAYS } else { 1 };
+            pass.dispatch_workgroups(across as u32, band.rows as u32, ways);
         })?;
         recorder.stage(Stage::Gather, |pass| {
             pass.set_bind_group(0, &gather, &[]);

@@ -157,7 +157,7 @@ impl Kernels {
             rasterize: Kernel::new(
                 gpu,
                 "rasterize",
-                &[wgsl::PROJECT, wgsl::RASTERIZE],
+                &[wgsl::PROJECT, &rasterize(gpu.lanes())],
                 &[Uniform, Uniform, Write, Read, Read, Read, Read, Write],
                 &["rasterize"],
             ),
@@ -280,8 +280,19 @@ impl ResidentKernels {
 const BACK_THREADS: usize = 64;
 const BACK_SPLATS: usize = 16;
 
+/// Workgroups of a tile in the backward pass with a lane per splat (rasterize_back_lanes.wgsl).
+pub(super) const BACK_WAYS: u32 = 8;
+
+/// The blend, which writes states for a backward pass with this many lanes (0: none).
+fn rasterize(lanes: usize) -> String {
+    with_constant(wgsl::RASTERIZE, "BUCKET", lanes)
+}
+
 /// The blend's backward pass for this device and its tuning.
 fn rasterize_back(gpu: &Gpu) -> String {
+    if gpu.lanes() > 0 {
+        return with_constant(wgsl::RASTERIZE_BACK_LANES, "LANES", gpu.lanes());
+    }
     match (gpu.has_subgroups(), gpu.tuning.back_vectors) {
         (false, _) => wgsl::RASTERIZE_BACK.into(),
         (true, false) => [wgsl::SUBGROUP_SUMS, wgsl::RASTERIZE_BACK_SUBGROUP].join("\n"),

@@ -3,9 +3,9 @@
 //
 // Two dispatches, a workgroup a tile of 16 x 16 pixels: `moments` writes the derivatives of SSIM to the local moments,
 // and what the tile adds to the value; `gradient` blurs these derivatives and writes the gradient to the rendered
-// image. Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: a word a pixel with 8 bits for red,
-// green, blue and weight, or three planes of f32, behind which is a plane of weights where pixels have some that are
-// not of 8 bits; 3 maps: nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials: sixteen
+// image. Bindings, group 0: 0 loss; 1 planes as rasterize.wgsl wrote them; 2 truth: bytes of pixel
+// after pixel, red, green, blue and, where pixels have weights of 8 bits, the weight; or three planes of f32. Behind
+// either, a plane of f32 of weights that are not of 8 bits; 3 maps: nine planes, three a colour; 4 d_planes: gradient to red, green and blue; 5 partials: sixteen
 // numbers per tile, |error|, SSIM and squared error with weights, one unused, the twelve of the camera's matrix and
 // offsets; 6 responses: those twelve, a camera after the other, without the identity. Six storage buffers, 14.5 KiB of
 // workgroup memory. A thread owns a pixel; in the passes along rows, every 256th number of the tile and its halo.
@@ -62,13 +62,15 @@ fn weight_of(at: u32) -> f32 {
     if ((loss.flags & LOSS_PLANE) == 0u) {
         return f32(truth[at] >> 24u) / 255.0;
     }
-    let planes_before = select(3u, 1u, (loss.flags & LOSS_PACKED) != 0u);
-    return bitcast<f32>(truth[planes_before * loss.width * loss.height + at]);
+    let numbers = 3u * loss.width * loss.height;
+    let before = select(numbers, (numbers + 3u) / 4u, (loss.flags & LOSS_PACKED) != 0u);
+    return bitcast<f32>(truth[before + at]);
 }
 
 fn truth_of(at: u32, channel: u32) -> f32 {
     if ((loss.flags & LOSS_PACKED) != 0u) {
-        return f32((truth[at] >> (8u * channel)) & 255u) / 255.0;
+        let byte = select(3u, 4u, (loss.flags & (LOSS_WEIGHTED | LOSS_PLANE)) == LOSS_WEIGHTED) * at + channel;
+        return f32((truth[byte / 4u] >> (8u * (byte % 4u))) & 255u) / 255.0;
     }
     return bitcast<f32>(truth[channel * loss.width * loss.height + at]);
 }

@@ -291,10 +291,11 @@ impl GpuRenderer {
 
     fn make_room_for_band(&mut self, band: Band, across: usize, width: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
-        let planes = plane_bytes(band, width);
+        let (planes, tiles) = (plane_bytes(band, width), band.rows * across);
+        let pairs = (b.pair_keys[0].bytes() / 4) as usize;
         b.bytes.ensure(gpu, planes / PLANES as u64)?;
-        let mut fresh = b.ranges.ensure(gpu, RANGE_BYTES * (band.rows * across) as u64)?;
-        fresh |= b.planes.ensure(gpu, planes)?;
+        let mut fresh = b.ranges.ensure(gpu, RANGE_BYTES * tiles as u64)?;
+        fresh |= b.planes.ensure(gpu, planes + state_bytes(gpu, pairs, tiles))?;
         Ok(fresh)
     }
 
@@ -327,7 +328,10 @@ impl GpuRenderer {
         let [r, g, b] = shot.background.map(f32::to_bits);
         let [skipped, plane_rows] =
             if way.whole { [band.first * TILE, shot.camera.height].map(|rows| rows as u32) } else { [0, pixel_rows] };
-        let blend = [r, g, b, limits[0], limits[1], first, pixel_rows, way.flags, way.sums_at, skipped, plane_rows, 0];
+        let whole = Band { first: 0, rows: (plane_rows as usize).div_ceil(TILE) };
+        let states_at = (plane_bytes(whole, shot.camera.width) / 4) as u32;
+        let blend =
+            [r, g, b, limits[0], limits[1], first, pixel_rows, way.flags, way.sums_at, skipped, plane_rows, states_at];
         put(out, slot::BLEND, &blend);
         for (i, draw) in draws.iter().enumerate() {
             put(out, slot::PIECES + i, std::slice::from_ref(&draw.piece));
@@ -506,6 +510,18 @@ fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
 /// Rows of pixels of a band in an image of `height`.
 fn pixel_rows(band: Band, height: usize) -> usize {
     (band.rows * TILE).min(height - band.first * TILE)
+}
+
+/// Bytes of the state of a tile's pixels before a bucket of splats (rasterize.wgsl): five numbers a pixel.
+const STATE_BYTES: u64 = 4 * 5 * (TILE * TILE) as u64;
+
+/// Bytes of the states of a band: of every bucket of `pairs` pairs, and of one more per tile, whose last one need not be
+/// full. None without lanes.
+fn state_bytes(gpu: &Gpu, pairs: usize, tiles: usize) -> u64 {
+    match gpu.lanes() {
+        0 => 0,
+        lanes => STATE_BYTES * (pairs / lanes + tiles + 1) as u64,
+    }
 }
 
 /// Bytes of a band's planes, rows beyond the image included.

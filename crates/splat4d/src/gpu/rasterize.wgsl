@@ -4,7 +4,7 @@
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile; the third is written: one past the last pair that
 // some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants); 5
 // shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each [rows of
-// the planes][width]. Six storage buffers, 12 KiB of workgroup memory. A workgroup owns a tile of 16 x 16 pixels, 64
+// the planes][width], and behind them the states (below). Six storage buffers, 12 KiB of workgroup memory. A workgroup owns a tile of 16 x 16 pixels, 64
 // neighbouring threads a quadrant of it, a thread per pixel; splats are read in batches by all threads together.
 
 const TILE: u32 = 16u;
@@ -16,6 +16,11 @@ const QUADRANT: u32 = 8u;
 const OWNER_SHIFT: u32 = 28u;
 const OWNER_SPLAT: u32 = 0x0fffffffu;
 const LOG2_E: f32 = 1.4426950408889634;
+// Before every so many splats of a tile, the state of its pixels is written behind the planes, where
+// rasterize_back_lanes.wgsl begins: red, green, blue, depth and transmittance, each [256 pixels]; where a pixel has
+// stopped, the transmittance 0 alone. 0: never (gpu/kernels.rs).
+const BUCKET: u32 = 0u;
+const STATE: u32 = 5u;
 
 struct Blend {
     background: vec3<f32>,
@@ -27,6 +32,7 @@ struct Blend {
     sums_at: u32,
     skipped: u32,    // rows of pixels of the planes above the band, and all of theirs
     plane_rows: u32,
+    states_at: u32,  // number of the first state behind the planes
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -47,6 +53,12 @@ var<workgroup> stopped: atomic<u32>;
 var<workgroup> all_stopped: u32;
 var<workgroup> last_used: atomic<u32>;
 var<workgroup> list: vec2<u32>;
+
+// The place of the state before splat `item` of a tile's list that begins at `first`.
+fn state_at(tile: u32, first: u32, item: u32) -> u32 {
+    let bucket = first / max(BUCKET, 1u) + tile + item / max(BUCKET, 1u);
+    return blend.states_at + bucket * STATE * THREADS;
+}
 
 @compute @workgroup_size(256)
 fn rasterize(
@@ -99,7 +111,19 @@ fn rasterize(
         }
         workgroupBarrier();
         let count = min(end - start, BATCH);
+        var closed = 0u;
         for (var i = 0u; open && i < count; i++) {
+            if (BUCKET != 0u) {
+                closed = i + 1u;
+                if ((start + i - first) % max(BUCKET, 1u) == 0u) {
+                    let at = state_at(tile, first, start + i - first) + thread;
+                    planes[at] = sum.x;
+                    planes[at + THREADS] = sum.y;
+                    planes[at + 2u * THREADS] = sum.z;
+                    planes[at + 3u * THREADS] = sum.w;
+                    planes[at + 4u * THREADS] = t;
+                }
+            }
             if (((batch_quadrants[i] >> quadrant) & 1u) == 0u) {
                 continue;
             }
@@ -120,6 +144,13 @@ fn rasterize(
             sum += (alpha * t) * batch_color[i];
             t = next;
             used = start + i + 1u;
+        }
+        if (BUCKET != 0u && !open) {
+            for (var i = closed; i < count; i++) {
+                if ((start + i - first) % max(BUCKET, 1u) == 0u) {
+                    planes[state_at(tile, first, start + i - first) + 4u * THREADS + thread] = 0.0;
+                }
+            }
         }
     }
     atomicMax(&last_used, used);

@@ -599,6 +599,10 @@ impl Resident for GpuRenderer {
         gpu.check()
     }
 
+    fn holds(&mut self, picture: usize, size: [usize; 2], weighted: bool) -> bool {
+        self.pictures.holds(picture, size, weighted)
+    }
+
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>> {
         self.begin(step)
     }

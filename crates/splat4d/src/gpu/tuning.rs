@@ -19,6 +19,9 @@ pub struct Tuning {
     /// Whether its backward pass with subgroups holds pixels in vectors (rasterize_back_vector.wgsl): changes last
     /// bits.
     pub back_vectors: bool,
+    /// Whether its backward pass with subgroups has a lane per splat, from states that the forward pass writes
+    /// (rasterize_back_lanes.wgsl): changes last bits, and takes 160 bytes per pair where subgroups have 32 threads.
+    pub back_lanes: bool,
     /// Splats of a round of its backward pass without them.
     pub back_round: usize,
 }
@@ -32,6 +35,7 @@ impl Default for Tuning {
             subgroups: true,
             sort_subgroups: true,
             back_vectors: false,
+            back_lanes: false,
             back_round: 4,
         }
     }
@@ -61,6 +65,7 @@ impl Tuning {
         out.extend(with(|t, v| t.batch = v, &BATCHES));
         out.push(Self { sort_subgroups: false, ..Self::default() });
         out.push(Self { back_vectors: true, ..Self::default() });
+        out.push(Self { back_lanes: true, ..Self::default() });
         let portable = Self { subgroups: false, ..Self::default() };
         out.push(portable);
         out.extend(BACK_ROUNDS.map(|back_round| Self { back_round, ..portable }));
@@ -77,6 +82,7 @@ impl Tuning {
                 ("subgroups", usize::from(t.subgroups)),
                 ("sort_subgroups", usize::from(t.sort_subgroups)),
                 ("back_vectors", usize::from(t.back_vectors)),
+                ("back_lanes", usize::from(t.back_lanes)),
                 ("back_round", t.back_round),
             ]
         };

@@ -81,6 +81,8 @@ pub struct RenderConfig {
     pub abs_grads: bool,
     /// Instructions to use; lowered to those of the machine.
     pub simd: Simd,
+    /// Bytes of ground-truth images that a device keeps; 0: a share of its free memory.
+    pub device_images: u64,
 }
 
 /// The smallest α cut-off that differs from 0: an extent must be finite.
@@ -106,6 +108,7 @@ impl Default for RenderConfig {
             antialias: Antialias::Off,
             abs_grads: false,
             simd: Simd::detect(),
+            device_images: 0,
         }
     }
 }

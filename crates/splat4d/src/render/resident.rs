@@ -230,10 +230,16 @@ pub trait Resident {
     ) -> Result<()>;
 
     /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in one
-    /// buffer, or no pixel of it counts, and nothing was begun.
+    /// buffer, no pixel of it counts, or a truth is left out that is not kept, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>>;
+
+    /// Whether it keeps this truth ([`Target::picture`]) in this size (width, height), with or without weights of pixels. A
+    /// step then needs only the shape of [`Target::truth`] and of [`Target::weight`], whose data may be empty.
+    fn holds(&mut self, _picture: usize, _size: [usize; 2], _weighted: bool) -> bool {
+        false
+    }
 
     /// The results of all steps that were begun, and not reported yet. Errors: as of `step`.
     fn finish(&mut self) -> Result<Vec<ResidentStepped>>;

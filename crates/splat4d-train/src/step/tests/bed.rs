@@ -81,6 +81,12 @@ impl Bed {
         Self { _place: place, frames }
     }
 
+    /// The training frames.
+    #[cfg(feature = "gpu")]
+    pub(super) fn frames(&self) -> Arc<Dataset> {
+        self.frames.clone()
+    }
+
     /// A run that has not begun.
     pub(super) fn start(&self, recipe: &Recipe) -> Trainer<'static> {
         self.start_on(Device::Cpu, recipe)

@@ -2,6 +2,7 @@
 
 use super::bed::{Bed, bytes, saved, settings};
 use super::gpu::{finish, on_gpu, steps_to};
+use crate::capture::frames::{Frames, Picture};
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
 use crate::step::resident::DeviceEngine;
@@ -11,8 +12,10 @@ use splat4d::render::{
     Abilities, Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras,
     ResidentLayer, ResidentNumbers, ResidentStep, ResidentStepped, Shot,
 };
-use splat4d::scene::{GEOMETRY, Table};
+use splat4d::scene::{Camera, GEOMETRY, Table, Time};
 use splat4d::{Error, ErrorKind, Result};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Recipes that stay on the device throughout: every kind of motion and of lifespan.
 const STAYS: [&str; 12] = [
@@ -152,6 +155,69 @@ fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
     assert!(bytes(resumed.scene()) == whole, "a resumed run has the bytes of one that was not stopped");
 }
 
+/// Frames that count how often they are loaded.
+struct Counted(Arc<dyn Frames>, Arc<AtomicUsize>);
+
+impl Frames for Counted {
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+    fn camera(&self, i: usize) -> &Camera {
+        self.0.camera(i)
+    }
+    fn time(&self, i: usize) -> Time {
+        self.0.time(i)
+    }
+    fn rig(&self, i: usize) -> usize {
+        self.0.rig(i)
+    }
+    fn name(&self, i: usize) -> String {
+        self.0.name(i)
+    }
+    fn load(&self, i: usize, out: &mut Picture) -> Result<()> {
+        self.1.fetch_add(1, Ordering::Relaxed);
+        self.0.load(i, out)
+    }
+}
+
+#[test]
+fn images_that_a_device_keeps_are_loaded_once() {
+    let bed = Bed::new();
+    let run = |line: &str| {
+        let mut trainer = on_gpu(&bed, &settings(line))?;
+        let loads = Arc::new(AtomicUsize::new(0));
+        trainer.set_frames(Arc::new(Counted(bed.frames(), loads.clone())));
+        let (mse, notices) = finish(&mut trainer, line);
+        assert!(notices.is_empty(), "{notices:?}");
+        Some((bytes(trainer.scene()), mse, loads.load(Ordering::Relaxed)))
+    };
+    let line = "motion=spacetime strategy=none iterations=120 half_size_until=0.4";
+    let Some((kept, mse, few)) = run(line) else { return };
+    // One byte: every step sends its image.
+    let (sent, other_mse, all) = run(&format!("{line} device_images=1")).expect("there was a GPU");
+    assert!(kept == sent && mse == other_mse, "it changes no bit");
+    // Every frame in both sizes, and again in another stage.
+    let frames = bed.frames().len();
+    assert!(all == 120 && few >= frames && few <= 4 * frames, "{all} and {few} loads of {frames} frames");
+}
+
+#[test]
+fn a_device_that_fails_is_followed_by_the_cpu_with_the_images() {
+    let bed = Bed::new();
+    let recipe = settings("motion=spacetime strategy=none half_size_until=0");
+    // The tables are the learner's at its last step, as after maintenance, so that nothing is lost.
+    let Some(device) = Failing::new([ALWAYS, 30, ALWAYS]) else { return };
+    let mut trainer = bed.start(&recipe);
+    trainer.set_engine(DeviceEngine::new(device));
+    let mut notices = Vec::new();
+    for _ in 0..30 {
+        notices.extend(trainer.step().unwrap().unwrap().notices);
+    }
+    trainer.settle().unwrap();
+    notices.extend(finish(&mut trainer, "on the CPU").1);
+    assert_eq!(notices, [format!("training continues on the CPU: {GONE}")]);
+}
+
 #[test]
 fn a_number_that_is_not_finite_is_found_and_named() {
     let bed = Bed::new();
@@ -260,6 +326,9 @@ impl Resident for Failing {
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>> {
         assert_eq!(step.alpha_min, ALPHA_MIN);
         self.tables(1)?.step(step)
+    }
+    fn holds(&mut self, picture: usize, size: [usize; 2], weighted: bool) -> bool {
+        self.device.resident().is_some_and(|resident| resident.holds(picture, size, weighted))
     }
     fn finish(&mut self) -> Result<Vec<ResidentStepped>> {
         self.here()?.resident().expect("a GPU").finish()

@@ -149,11 +149,13 @@ impl GpuRenderer {
             let target = &view.target;
             let size = [target.truth.width, target.truth.height];
             assert_eq!(size, [view.camera.width, view.camera.height], "an image and its truth have one shape");
+            let left_out = target.truth.data.is_empty();
             able &= self.can_compare(n, size);
+            able &= !left_out || self.pictures.holds(target.picture, size, target.weight.is_some());
             if !able {
                 break;
             }
-            let held = self.pictures.hold(&self.gpu, target)?;
+            let held = self.pictures.hold(&self.gpu, target, self.config.device_images)?;
             able &= held.weight > 0.0;
             views.push(PendingView {
                 camera: view.camera.clone(),

@@ -163,16 +163,21 @@ fn kept(r: &mut GpuRenderer, ties: Option<&ResidentTies>) -> Result<Params<f32>>
     Ok(p)
 }
 
-/// Begins a step on these cameras, with losses on rows and noise: steps that are done.
+/// Begins a step on these cameras, with losses on rows and noise: steps that are done. Truths that are held are left
+/// out.
 fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<ResidentStepped>> {
-    let truth = |camera: &Camera| {
+    let number_of = |i: usize, camera: &Camera| 100 * camera.width + i;
+    let mut truth = |(i, camera): (usize, &Camera)| {
         let mut truth = Planes::new(3, camera.height, camera.width);
         truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
+        if r.holds(number_of(i, camera), [camera.width, camera.height], false) {
+            truth.data.clear();
+        }
         truth
     };
-    let truths: Vec<Planes<f32>> = cameras.iter().map(truth).collect();
+    let truths: Vec<Planes<f32>> = cameras.iter().enumerate().map(&mut truth).collect();
     let view = |(i, camera): (usize, _)| {
-        let picture = 100 * truths[i].width + i;
+        let picture = number_of(i, camera);
         let target = Target { truth: &truths[i], weight: None, picture, dssim: 0.2, response: None };
         ResidentView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
     };
@@ -219,15 +224,44 @@ fn one(camera: &Camera) -> [(&[Camera], f64); 1] {
 fn tunings_change_no_bit() {
     let camera = camera([0.0, 0.0, -4.0], 61, 47);
     // By the forms of the blend's backward pass, which alone change bits.
-    let mut first = std::collections::HashMap::<[bool; 2], After>::new();
+    let mut first = std::collections::HashMap::<[bool; 3], After>::new();
     for tuning in crate::gpu::Tuning::sweep() {
         let Some(gpu) = crate::gpu::tests::gpu() else { return };
         let mut r = GpuRenderer::new(gpu.tuned(tuning), Default::default()).expect("the kernels compile");
         let now = stepped(&mut r, &one(&camera));
         assert!(now.0[0].bad.is_none() && now.0[0].loss > 0.0 && r.stats().pairs > ROWS, "{:?}", r.stats());
-        let first = first.entry([tuning.subgroups, tuning.back_vectors]).or_insert_with(|| now.clone());
+        let first =
+            first.entry([tuning.subgroups, tuning.back_vectors, tuning.back_lanes]).or_insert_with(|| now.clone());
         assert!(*first == now, "{:?} changes bits", tuning.changes());
     }
+}
+
+#[test]
+fn truths_that_are_held_may_be_left_out() {
+    let Some(mut r) = own_renderer() else { return };
+    let camera = camera([0.0, 0.0, -4.0], 61, 47);
+    let steps: [(&[Camera], f64); 3] = [(std::slice::from_ref(&camera), 0.01); 3];
+    // With no room, every step sends its truth.
+    let poor = &mut own_renderer().expect("it was there");
+    poor.pictures.budget = Some(0);
+    assert!(stepped(&mut r, &steps) == stepped(poor, &steps));
+    assert_eq!((r.pictures.sent, poor.pictures.sent), (1, 3));
+    assert!(r.holds(6100, [61, 47], false) && !r.holds(6100, [61, 47], true) && !r.holds(6101, [61, 47], false));
+    assert!(!r.holds(6100, [47, 61], false) && !poor.holds(6100, [61, 47], false));
+    // One that is not held is required.
+    let truth = Planes { data: Vec::new(), ..Planes::new(3, 47, 61) };
+    let target = Target { truth: &truth, weight: None, picture: 7, dssim: 0.2, response: None };
+    let view = ResidentView { camera: &camera, t: Time(0.0), background: [0.5; 3], target, rig: 0 };
+    let step = ResidentStep {
+        views: &[view],
+        sh_degree: 0,
+        alpha_min: 1.0 / 255.0,
+        rules: &[[const { None }; KEPT]],
+        rows: RowWeights::default(),
+        noise: &[None],
+        cameras: 0.0,
+    };
+    assert!(r.step(&step).expect("nothing fails").is_none());
 }
 
 /// Images of few pairs, then of more than fit, at a first view and at a later one.

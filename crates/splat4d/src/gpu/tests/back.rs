@@ -248,6 +248,20 @@ fn with_pixels_in_vectors_each_kernel_equals_its_twin_too() {
     each_equals_its_twin(&mut GpuRenderer::new(vectors, RenderConfig::default()).expect("the kernels compile"));
 }
 
+#[test]
+fn with_a_lane_per_splat_each_kernel_equals_its_twin_too() {
+    let Some(mut r) = with_lanes() else { return };
+    each_equals_its_twin(&mut r);
+}
+
+/// A renderer whose blend's backward pass has a lane per splat.
+fn with_lanes() -> Option<GpuRenderer> {
+    let lanes = gpu()?.tuned(Tuning { back_lanes: true, ..Tuning::default() });
+    println!("{} lanes on {}", lanes.lanes(), lanes.describe());
+    assert_eq!(lanes.lanes() > 0, lanes.has_subgroups());
+    Some(GpuRenderer::new(lanes, RenderConfig::default()).expect("the kernels compile"))
+}
+
 fn each_equals_its_twin(r: &mut GpuRenderer) {
     r.config.abs_grads = true;
     for (scene, camera) in [
@@ -331,13 +345,18 @@ fn each_equals_its_twin(r: &mut GpuRenderer) {
 
 #[test]
 fn the_backward_pass_repeats_bit_for_bit_in_bands() {
-    let Some(mut r) = own_renderer() else { return };
+    for r in [own_renderer(), with_lanes()].into_iter().flatten() {
+        repeats_in_bands(r);
+    }
+}
+
+fn repeats_in_bands(mut r: GpuRenderer) {
     r.for_training().expect("the kernels compile");
     let (scene, camera) = (Scenery::new(50, 4000, 1.2, 0.08), camera([0.0, 0.5, -4.0], 150, 110));
     let (splats, pulled) = (scene.splats(), Pulled::new(51, &camera));
     let shot = shot(&splats, &camera);
     let (_, first, first_sh) = back(&mut r, &shot, &pulled.all());
-    let pairs = r.stats().pairs;
+    let (pairs, most) = (r.stats().pairs, r.most_pairs);
     let (_, second, second_sh) = back(&mut r, &shot, &pulled.all());
     let all = |d: &RenderGrads<f32>, sh: &[Option<Table<f32>>]| {
         named(d, sh).into_iter().filter(|(name, _)| name != "background").collect::<Vec<_>>()
@@ -352,7 +371,7 @@ fn the_backward_pass_repeats_bit_for_bit_in_bands() {
     assert!(all(&first, &first_sh) == all(&bands, &bands_sh), "bands change no bit");
     assert!(first.background == bands.background);
     // Small buffers at first, which must overflow, then larger ones.
-    (r.most_pairs, r.buffers, r.groups) = (MOST_PAIRS, Buffers::new(), None);
+    (r.most_pairs, r.buffers, r.groups) = (most, Buffers::new(), None);
     r.make_room_for_pairs(1000).expect("a little room");
     let (_, grown, grown_sh) = back(&mut r, &shot, &pulled.all());
     assert!(r.stats().bands == 1 && all(&first, &first_sh) == all(&grown, &grown_sh), "room changes no bit");

@@ -190,7 +190,7 @@ fn comparison_repeats_bit_for_bit_at_any_budget_and_images_are_uploaded_once() {
     assert!(first == bits(compared(&mut r, &shot, &target(0))), "room changes no bit");
     // A budget that holds two images: the third is sent whenever it is needed.
     let one = r.pictures.bytes();
-    r.pictures.budget = 2 * one;
+    r.pictures.budget = Some(2 * one);
     for picture in [1, 2, 0, 1, 2] {
         assert!(first == bits(compared(&mut r, &shot, &target(picture))));
     }
