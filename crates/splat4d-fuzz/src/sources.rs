@@ -52,6 +52,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("files.rs", PASSED),
     ("following.rs", Not("lines of its own table, which are kept as they are")),
     ("format/gltf/mod.rs", By(&["gltf", "glb"])),
+    ("generated.rs", By(&["rig_cameras"])),
     ("growing.rs", By(&["playback"])),
     ("models/mod.rs", By(&["model_toml"])),
     (
@@ -103,7 +104,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("storage/s3.rs", PASSED),
     ("storage/work.rs", By(&["capture_json"])),
     ("sound.rs", By(&["sound_mp4", "capture_json", "playback"])),
-    ("training.rs", By(&["scene"])),
+    ("training.rs", By(&["scene", "capture_json"])),
     ("exporting.rs", By(&["points"])),
     ("verbs/predict.rs", By(&["actions"])),
     ("verbs/train.rs", By(&["recipe"])),

@@ -79,6 +79,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "corrections",
             "write",
             "shipped",
+            "generated",
             "recording",
             "doctor",
         ],

@@ -93,7 +93,9 @@ impl Fit<'_> {
         let scene = self.split(&active, &plan, exposure.as_ref())?;
         let mut stage = still_method::stage(&format!("frame {}", self.frame), &plan);
         stage.freeze_exposure = true;
-        for group in stage.groups.iter_mut().filter(|g| g.column != "means") {
+        // The first frame has unlocked all degrees.
+        stage.sh_interval = 0;
+        for group in &mut stage.groups {
             group.rate.start *= follow.rates;
             group.rate.end *= follow.rates;
         }
