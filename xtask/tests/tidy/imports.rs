@@ -80,6 +80,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "write",
             "shipped",
             "generated",
+            "predicted",
             "recording",
             "doctor",
         ],
