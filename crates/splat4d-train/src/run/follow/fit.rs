@@ -21,11 +21,11 @@ use std::time::{Duration, Instant};
 const ORIGIN: (&str, &str) = ("follow", "origin");
 /// Time between two reports of progress.
 const REPORT: Duration = Duration::from_millis(250);
-/// Views by which it is decided whether Gaussians go on as they moved.
+/// Views by which it is decided whether Gaussians continue their motion.
 const LOOKS: usize = 6;
 /// Longest step that a Gaussian repeats in the next frame, extents (as `tracked.velocity_cap`).
 const VELOCITY_CAP: f64 = 0.05;
-/// A frame may always add so many Gaussians.
+/// A frame may always add this many Gaussians.
 const LEAST_GROWTH: usize = 64;
 
 /// Steps until all stages are done. Returns whether they are: a stop was requested otherwise.
