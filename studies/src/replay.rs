@@ -136,7 +136,7 @@ impl Recording {
         Ok(Self { frames, to: to.to_owned() })
     }
 
-    /// Copies a frame every so many seconds, then states the end.
+    /// Copies a frame every `every` seconds, then states the end.
     fn play(&self, every: f64, stopped: &dyn Fn() -> bool) -> Result<()> {
         for files in self.frames.values() {
             files.iter().try_for_each(|(from, to)| copy(from, to))?;

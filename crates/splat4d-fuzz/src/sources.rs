@@ -52,6 +52,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("files.rs", PASSED),
     ("following.rs", Not("lines of its own table, which are kept as they are")),
     ("format/gltf/mod.rs", By(&["gltf", "glb"])),
+    ("generated.rs", By(&["rig_cameras"])),
     ("growing.rs", By(&["playback"])),
     ("models/mod.rs", By(&["model_toml"])),
     (
@@ -66,6 +67,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("paths/keys.rs", By(&["camera_path"])),
     ("playable.rs", By(&["playback"])),
     ("predicting/score.rs", By(&["true_tracks", "npy"])),
+    ("importing.rs", By(&["predicted_npz"])),
     (
         "priors.rs",
         Not("the list and the notes that it wrote itself, in plain data; the reader of the list is `priors_json`"),
@@ -103,7 +105,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("storage/s3.rs", PASSED),
     ("storage/work.rs", By(&["capture_json"])),
     ("sound.rs", By(&["sound_mp4", "capture_json", "playback"])),
-    ("training.rs", By(&["scene"])),
+    ("training.rs", By(&["scene", "capture_json"])),
     ("exporting.rs", By(&["points"])),
     ("verbs/predict.rs", By(&["actions"])),
     ("verbs/train.rs", By(&["recipe"])),

@@ -8,6 +8,8 @@ use splat4d_dynamics::actions::Actions;
 use splat4d_import::calibration;
 use splat4d_import::check_clicks;
 use splat4d_import::corrections::{self, Corrections};
+use splat4d_import::generated;
+use splat4d_import::predicted::Predicted;
 use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
 use splat4d_workflow::texts::{self, Page};
@@ -30,9 +32,30 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "compress_toml", seeds: || seeds(&[ORDER]), read: |b| drop(texts::compress_order(&text(b))) },
     Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
     Reader { name: "model_toml", seeds: models, read: |b| drop(texts::model(&text(b))) },
+    Reader { name: "rig_cameras", seeds: || seeds(&[RIG]), read: |b| drop(generated::check_cameras(b)) },
+    Reader { name: "predicted_npz", seeds: predictions, read: |b| drop(Predicted::read(b).map(|p| p.len())) },
     Reader { name: "edit_request", seeds: requests, read: edit_request },
     Reader { name: "video_avi", seeds: films, read: film },
 ];
+
+const RIG: &str = r#"{"camera_model": "OPENCV", "cameras": [{"camera_id": 0, "K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]],
+    "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3], [0, 0, 0, 1]], "image_width": 64, "image_height": 48,
+    "video": "videos/dense/00.mp4"}]}"#;
+
+fn predictions() -> Vec<Vec<u8>> {
+    let (pose, lens) =
+        ([1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0], [5.0, 0.0, 1.0, 0.0, 5.0, 1.0, 0.0, 0.0, 1.0]);
+    let (pixels, depth) = ([0.5; 12], [2.0; 4]);
+    let mut bytes = Vec::new();
+    let arrays: [(&str, &[usize], &[f32]); 4] = [
+        ("images", &[1, 3, 2, 2], &pixels),
+        ("extrinsic", &[1, 3, 4], &pose),
+        ("intrinsic", &[1, 3, 3], &lens),
+        ("depth", &[1, 2, 2, 1], &depth),
+    ];
+    splat4d::format::npy::write_archive(&arrays, &mut bytes).expect("memory takes it");
+    vec![bytes]
+}
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()

@@ -16,6 +16,8 @@
 //! | `corrections.rs` | `import.toml`: results per camera, corrected by hand and read again |
 //! | `write/` | images, masks, times and `capture.json`, continued after an interruption |
 //! | `shipped.rs` | frames of captures shipped as a video per camera with poses (Neural 3D Video) |
+//! | `generated.rs` | rigs that a network generated (4DAnyone): poses and a video per view |
+//! | `predicted.rs` | poses, depth and images that a network predicted, in one `.npz` (VGGT, Depth Anything 3) |
 //! | `recording/` | the whole import: inputs, synchronisation, given calibrations, COLMAP, poses and time offsets in turn, unit and axes, delay of sound, cache, report |
 //! | `doctor/` | problems of a capture: one camera (`look.rs`, `alone.rs`), pairs of cameras (`between.rs`), time offsets and rolling shutters, the dynamic volume, the list of findings (`check.rs`) |
 
@@ -24,6 +26,8 @@ pub mod calibration;
 mod clicks;
 pub mod corrections;
 pub mod doctor;
+pub mod generated;
+pub mod predicted;
 pub mod recording;
 pub mod sfm;
 pub mod shipped;

@@ -234,7 +234,7 @@ export class SceneFile {
     if (!this.growing) return;
     this.#timer = setTimeout(async () => {
       const timer = this.#timer;
-      // Without a connection there is nothing new; it may come back.
+      // Without a connection there is nothing new, for now.
       const head = await this.#source.read(0, HEAD).catch(() => []);
       if (timer !== this.#timer) return;
       if (head.length === HEAD && long(new DataView(head.buffer, head.byteOffset), 16) !== this.length) more();

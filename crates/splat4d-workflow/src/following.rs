@@ -26,7 +26,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Time between two looks for a frame.
+/// Time between two checks whether a frame is there.
 const POLL: Duration = Duration::from_millis(100);
 /// Message when following is stopped.
 const SAVING: &str = "stopping: finished frames are kept";

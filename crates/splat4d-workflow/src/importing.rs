@@ -1,12 +1,14 @@
 //! The work behind `import`: videos become a capture, which is checked.
 
 use crate::events::Listener;
+use crate::files;
 use crate::report::doctor;
 use serde_json::{Value, json};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_import::calibration;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
+use splat4d_import::predicted::Predicted;
 use splat4d_import::recording::{self, CameraReport, Report, Request};
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
@@ -19,7 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// The file by which a capture is recognised.
 const CAPTURE: &str = "capture.json";
 /// Files that an import writes into its folder, in addition to its corrections.
-const WRITTEN: [&str; 6] = [CAPTURE, "points.ply", "images", "masks", "import", "sound.m4a"];
+const WRITTEN: [&str; 7] = [CAPTURE, "points.ply", "images", "masks", "depth", "import", "sound.m4a"];
 /// Files by which a run is recognised.
 const RUN: [&str; 2] = ["recipe.toml", "run.json"];
 /// Findings of the doctor that the text contains; its page has all.
@@ -69,6 +71,27 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     };
     warnings(&report).iter().for_each(|w| console.warn(w));
     Ok(Imported { report, checked })
+}
+
+/// Makes a capture of poses, depth and images that a network predicted, in one `.npz` (VGGT, Depth Anything 3); training
+/// refines its poses. Returns the result in words.
+///
+/// Errors: not such a file; the folder contains a capture of another program; no space.
+pub fn import_predicted(file: &Path, folder: &Path, console: &dyn Listener) -> Result<String> {
+    check_ours(folder)?;
+    check_apart(folder, &[Input::new(file, "what is imported,")])?;
+    let _owned = OutputFolder::amend(folder, "import")?;
+    console.phase("reading the prediction", 0, 0);
+    let predicted = Predicted::read(&files::read(file)?).map_err(|e| e.at(file.display()))?;
+    predicted.write(folder)?;
+    console.clear();
+    let [width, height] = predicted.size;
+    Ok(format!(
+        "{}: {} images of {width}x{height} with the poses of {}, which training refines",
+        folder.display(),
+        predicted.len(),
+        predicted.network
+    ))
 }
 
 /// An error of an import.

@@ -13,7 +13,7 @@ use serde_json::json;
 use splat4d::device::Device;
 use splat4d::{Error, ErrorKind, Result};
 #[cfg(feature = "import")]
-use splat4d_import::shipped;
+use splat4d_import::{generated, shipped};
 use splat4d_train::capture::{Capture, Lenses, Severity, Timing};
 use splat4d_train::event::Event;
 #[cfg(feature = "import")]
@@ -139,6 +139,7 @@ pub fn train(
     let listener = &Recorded::new(listener);
     let work = Work::new(options, stop, listener)?;
     extract(capture, stop, listener)?;
+    let recipe = &refined(capture, recipe, listener);
     let (minutes, predict, output) = (options.minutes, options.predict, options.output.as_deref());
     work.begin(&Begin { capture, recipe, minutes, predict, output, resumed: false })
 }
@@ -414,6 +415,22 @@ impl<'a> Work<'a> {
     }
 }
 
+/// The recipe for a capture whose poses a network predicted or was given: it refines them.
+fn refined(source: &Path, recipe: &Recipe, listener: &dyn Listener) -> Recipe {
+    let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
+    let file = root.join("capture.json");
+    let text = file.is_file().then(|| files::read_text(&file).ok()).flatten();
+    let value: Option<serde_json::Value> = text.and_then(|text| serde_json::from_str(&text).ok());
+    let by = value.and_then(|v| v["extra"]["predicted_poses"].as_str().map(str::to_owned));
+    match by {
+        Some(by) if !recipe.refine.poses => {
+            listener.result(&format!("poses of {by} are refined during training (refine.poses)"));
+            recipe.clone().with(|r| r.refine.poses = true)
+        }
+        _ => recipe.clone(),
+    }
+}
+
 /// Without the importer a capture's frames must be there.
 #[cfg(not(feature = "import"))]
 fn extract(_: &Path, _: &AtomicBool, _: &dyn Listener) -> Result<()> {
@@ -424,11 +441,15 @@ fn extract(_: &Path, _: &AtomicBool, _: &dyn Listener) -> Result<()> {
 #[cfg(feature = "import")]
 fn extract(source: &Path, stop: &AtomicBool, listener: &dyn Listener) -> Result<()> {
     let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
-    if shipped::videos(root).is_empty() {
+    if shipped::videos(root).is_empty() && !generated::is_rig(root) {
         return Ok(());
     }
     let mut listen = |event: &Event| listener.event(event);
-    let found = shipped::extract(root, &mut Progress(&mut listen), &|| stop.load(Ordering::SeqCst))?;
+    let (progress, stopped) = (&mut Progress(&mut listen), || stop.load(Ordering::SeqCst));
+    let found = match generated::extract(root, progress, &stopped)? {
+        None => shipped::extract(root, progress, &stopped)?,
+        found => found,
+    };
     listener.clear();
     let Some(found) = found else { return Ok(()) };
     found.warnings.iter().for_each(|w| listener.warn(w));

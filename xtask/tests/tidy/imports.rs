@@ -79,6 +79,8 @@ const ORDER: [(&str, &[&str]); 9] = [
             "corrections",
             "write",
             "shipped",
+            "generated",
+            "predicted",
             "recording",
             "doctor",
         ],

@@ -3,13 +3,15 @@
 use crate::console::Console;
 use crate::interrupt;
 use crate::serving::{self, Place};
+use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
+use splat4d_import::predicted;
 use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_workflow::aligning::Aligning;
-use splat4d_workflow::importing::import;
+use splat4d_workflow::importing::{import, import_predicted};
 use splat4d_workflow::parts::left_out;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -32,7 +34,8 @@ the same command again. Then: splat4d train my-take. How to record: docs/filming
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Videos, folders of videos, or folders of images (one per camera)
+    /// Videos, folders of videos, or folders of images (one per camera); or one .npz with poses and depth from VGGT or
+    /// Depth Anything 3
     #[arg(value_name = "VIDEOS", required = true)]
     videos: Vec<PathBuf>,
     /// The capture's folder; interrupted work continues
@@ -175,6 +178,15 @@ fn clicked(request: &Request, place: &Place, stop: &AtomicBool, console: &Consol
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.assist && !cfg!(feature = "serve") {
         return Err(left_out("--assist", "serve").into());
+    }
+    if let [file] = &args.videos[..]
+        && predicted::is_archive(file)
+    {
+        let words = import_predicted(file, &args.output, console)?;
+        console.print_line(&words);
+        console.emit(&json!({ "type": "imported", "report": { "words": words } }));
+        console.next("train", &args.output);
+        return Ok(());
     }
     let mut request = Request {
         inputs: args.videos.clone(),

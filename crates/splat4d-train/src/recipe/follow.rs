@@ -9,7 +9,7 @@ settings! {
         /// Seconds without a complete frame after which the capture counts as finished.
         timeout: f64 = 60.0 => positive().unit("seconds");
         /// Training steps of the first frame.
-        first_steps: usize = 2000 => at_least(1).unit("iterations");
+        first_steps: usize = 3000 => at_least(1).unit("iterations");
         /// Training steps of every later frame.
         frame_steps: usize = 200 => at_least(1).unit("iterations");
         /// A tile of an image disagrees with the scene where its mean absolute error rises by more than this (colours
@@ -17,7 +17,7 @@ settings! {
         changed: f64 = 0.008 => positive();
         /// Share of what images show of a Gaussian that must lie in such tiles before the Gaussian learns.
         share: f64 = 0.3 => share();
-        /// Rates of colour, opacity, scale and rotation in later frames, of those of the first one.
+        /// Learning rates of later frames, of those of the first one.
         rates: f64 = 0.5 => positive();
         /// Largest share of Gaussians that a frame adds.
         growth: f64 = 0.02;

@@ -24,7 +24,9 @@ impl Take {
         cameras.truncate(CAMERAS);
         for camera in cameras {
             let camera = camera.as_object_mut().unwrap();
-            ["frames", "masks"].map(|key| camera.remove(key));
+            for key in ["frames", "masks"] {
+                camera.remove(key);
+            }
         }
         for key in ["frames", "labels", "hold_out"] {
             value.as_object_mut().unwrap().remove(key);

@@ -52,7 +52,7 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    /// Looks for a frame once; a file that is new is complete at the second look at the earliest.
+    /// Examines the files of a frame once; a file that is new is complete at the second call at the earliest.
     ///
     /// Errors: an image of another size than its camera's first one.
     pub(super) fn look(&mut self, root: &Path, frame: usize, options: &CaptureOptions) -> Result<Arrival> {
@@ -134,7 +134,7 @@ impl Watch {
     }
 }
 
-/// A look at a file that does not change: its image's size, or why there is none.
+/// The state of a file that does not change: its image's size, or why there is none.
 fn decoded(path: &Path, now: Look) -> Look {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
     if now.length == 0 {

@@ -21,11 +21,11 @@ use std::time::{Duration, Instant};
 const ORIGIN: (&str, &str) = ("follow", "origin");
 /// Time between two reports of progress.
 const REPORT: Duration = Duration::from_millis(250);
-/// Views by which it is decided whether Gaussians go on as they moved.
+/// Views by which it is decided whether Gaussians continue their motion.
 const LOOKS: usize = 6;
 /// Longest step that a Gaussian repeats in the next frame, extents (as `tracked.velocity_cap`).
 const VELOCITY_CAP: f64 = 0.05;
-/// A frame may always add so many Gaussians.
+/// A frame may always add this many Gaussians.
 const LEAST_GROWTH: usize = 64;
 
 /// Steps until all stages are done. Returns whether they are: a stop was requested otherwise.
@@ -93,7 +93,9 @@ impl Fit<'_> {
         let scene = self.split(&active, &plan, exposure.as_ref())?;
         let mut stage = still_method::stage(&format!("frame {}", self.frame), &plan);
         stage.freeze_exposure = true;
-        for group in stage.groups.iter_mut().filter(|g| g.column != "means") {
+        // The first frame has unlocked all degrees.
+        stage.sh_interval = 0;
+        for group in &mut stage.groups {
             group.rate.start *= follow.rates;
             group.rate.end *= follow.rates;
         }

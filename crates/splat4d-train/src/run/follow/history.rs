@@ -128,7 +128,7 @@ impl History {
         }
     }
 
-    /// The poses to which these rows go on as they moved in the last frame; none: it did not move.
+    /// The pose of a row if it continues the motion of the last frame; none: it did not move.
     pub(super) fn extrapolated(&self, row: usize, cap: f32) -> Option<Pose> {
         let (now, before) =
             (pose(&self.layer.params, row), self.before[row].filter(|_| self.since[row] == self.frame)?);
@@ -178,17 +178,17 @@ fn numbers(params: &Params<f32>, row: usize) -> Box<[f32]> {
     params[GEOMETRY].read::<ROW>(row, 0).into_iter().chain(sh).collect()
 }
 
-/// The largest nodes of the binary tree over `node` that `wanted` fills.
-fn cover(node: Range<usize>, wanted: &Range<usize>, give: &mut dyn FnMut(Range<usize>)) {
-    if wanted.start <= node.start && node.end <= wanted.end {
+/// The largest nodes of the binary tree over `node` that the frames `within` fill.
+fn cover(node: Range<usize>, within: &Range<usize>, give: &mut dyn FnMut(Range<usize>)) {
+    if within.start <= node.start && node.end <= within.end {
         return give(node);
     }
     let middle = node.start + node.len() / 2;
-    if wanted.start < middle {
-        cover(node.start..middle, wanted, give);
+    if within.start < middle {
+        cover(node.start..middle, within, give);
     }
-    if wanted.end > middle {
-        cover(middle..node.end, wanted, give);
+    if within.end > middle {
+        cover(middle..node.end, within, give);
     }
 }
 

@@ -70,7 +70,7 @@ pub struct Following {
     state: Option<State>,
 }
 
-/// The scene so far.
+/// The present scene.
 struct State {
     history: History,
     exposure: Vec<f32>,

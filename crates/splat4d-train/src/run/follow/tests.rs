@@ -19,7 +19,7 @@ impl Recorded {
         let (whole, folder) = (Place::new(), tempfile::tempdir().unwrap());
         std::fs::copy(whole.source().join("capture.json"), folder.path().join("capture.json")).unwrap();
         let short = ["follow.first_steps=30", "follow.frame_steps=8", "follow.changed=0.001", "follow.share=0.05"];
-        let recipe = recipe(&[&short, changes].concat());
+        let recipe = recipe(&[&short[..], changes].concat());
         Self { whole, folder, recipe }
     }
 
@@ -43,7 +43,7 @@ impl Recorded {
 
     /// Looks until a frame is there, as a new file needs a second look.
     fn arrives(following: &mut Following, frame: usize) -> Arrival {
-        let _ = following.look(frame).unwrap();
+        following.look(frame).unwrap();
         following.look(frame).unwrap()
     }
 }
@@ -184,7 +184,7 @@ fn a_frame_arrives_when_all_its_images_are_complete() {
     // Another size is refused at once.
     capture.record(1, 0..4);
     image::RgbImage::new(8, 8).save(capture.image(2, 1)).unwrap();
-    let _ = following.look(1);
+    following.look(1).unwrap();
     let error = following.look(1).unwrap_err().to_string();
     assert!(error.contains("8x8") && error.contains("24x24"), "{error}");
     capture.record(1, 0..4);
