@@ -66,8 +66,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let [folder, online, offline] = ["capture", "online", "offline"].map(|name| args.output.join(name));
     let recording = Recording::begin(&args.capture, &recipe, &folder)?;
     let ended = AtomicBool::new(false);
+    let stopped = || ended.load(Ordering::Relaxed) || stop.load(Ordering::Relaxed);
     let followed = std::thread::scope(|scope| {
-        let stopped = || ended.load(Ordering::Relaxed) || stop.load(Ordering::Relaxed);
         let recorder = scope.spawn(|| recording.play(args.every, &stopped));
         let followed = following::follow(&folder, &recipe, &options(&online), &stop, console);
         ended.store(true, Ordering::Relaxed);
