@@ -5,7 +5,9 @@ use crate::zip::zip;
 use image::{ImageBuffer, ImageFormat, Luma, Rgb};
 use serde_json::json;
 use splat4d::format::npy;
-use splat4d_train::capture::{Capture, CaptureOptions, ImageStore, Rgb8};
+use splat4d::math::Se3;
+use splat4d::scene::Camera;
+use splat4d_train::capture::{Capture, CaptureOptions, ImageStore, Rgb8, check_scan};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -74,19 +76,19 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "depth_npy", seeds: || vec![floats(&[6, 8])], read: |b| open("npy", "depth.npy", b) },
     Reader { name: "depth_exr", seeds: || vec![exr()], read: |b| open("exr", "depth.exr", b) },
     Reader { name: "depth_png", seeds: || vec![depth_png()], read: |b| open("png", "depth.png", b) },
-    Reader { name: "scan_las", seeds: || vec![las()], read: |b| open("scan_las", "scan.las", b) },
-    Reader { name: "scan_pcd", seeds: pcds, read: |b| open("scan_pcd", "scan.pcd", b) },
-    Reader { name: "scan_e57", seeds: || vec![e57_scan()], read: |b| open("scan_e57", "scan.e57", b) },
-    Reader { name: "scan_obj", seeds: || vec![OBJ.into()], read: |b| open("scan_obj", "scan.obj", b) },
-    Reader { name: "scan_ply", seeds: || vec![MESH.into()], read: |b| open("scan_ply", "scan.ply", b) },
+    Reader { name: "scan_las", seeds: || vec![las()], read: |b| scan("scan_las", "scan.las", b) },
+    Reader { name: "scan_pcd", seeds: pcds, read: |b| scan("scan_pcd", "scan.pcd", b) },
+    Reader { name: "scan_e57", seeds: || vec![e57_scan()], read: |b| scan("scan_e57", "scan.e57", b) },
+    Reader { name: "scan_obj", seeds: || vec![OBJ.into()], read: |b| scan("scan_obj", "scan.obj", b) },
+    Reader { name: "scan_ply", seeds: || vec![MESH.into()], read: |b| scan("scan_ply", "scan.ply", b) },
     Reader { name: "picture", seeds: pictures, read: |b| drop(Rgb8::decode(b, Path::new("picture"))) },
 ];
 
 /// The list of what networks wrote.
 const PRIORS: &str = r#"{"version": 1, "writer": "splat4d", "depth": {"kind": "inverse", "scale": 1.0, "files": {"images/0.png": "depth/0.npy"}},
 "masks": {"files": {"images/0.png": "masks/0.png"}}, "tracks": {"files": {"a": "tracks.csv"}}}"#;
-/// Of as many lengths of a mesh's file, one is read with its initial points.
-const SAMPLED: usize = 64;
+/// Of as many sums of the bytes of a scan, one opens a capture, which takes fifty times as long as reading the scan.
+const OPENED: u32 = 64;
 const WIDTH: u32 = 8;
 const HEIGHT: u32 = 6;
 
@@ -101,18 +103,22 @@ fn open(layout: &'static str, file: &str, bytes: &[u8]) {
     FOLDERS.with_borrow_mut(|folders| {
         let folder = folders.entry(layout).or_insert_with(|| made(layout));
         write(folder.path(), file, bytes);
-        // Drawing initial points on a mesh takes a hundred times as long as reading it, and depends on its bytes
-        // through its triangles alone.
-        let mut options = CaptureOptions::default();
-        if ["scan_obj", "scan_ply"].contains(&layout) && !bytes.len().is_multiple_of(SAMPLED) {
-            options.max_points = 0;
-        }
-        if let Ok(capture) = Capture::open(folder.path(), &options) {
+        if let Ok(capture) = Capture::open(folder.path(), &CaptureOptions::default()) {
             let _ = capture.check_labels(&capture.frames[0]);
             let store = ImageStore::new(Arc::new(capture), 1 << 20);
             let _ = store.load(0);
         }
     });
+}
+
+/// Reads a scan and renders its depth; with some bytes in a capture, which draws initial points on it.
+fn scan(layout: &'static str, file: &str, bytes: &[u8]) {
+    let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+    let camera = Camera::with_fov_y(pose, 0.8, WIDTH as usize, HEIGHT as usize);
+    let _ = check_scan(bytes, Path::new(file), &camera);
+    if bytes.iter().map(|b| u32::from(*b)).sum::<u32>().is_multiple_of(OPENED) {
+        open(layout, file, bytes);
+    }
 }
 
 /// A rig of two cameras and two frames.

@@ -273,6 +273,16 @@ impl Geometry {
     }
 }
 
+/// Reads a file of this name and renders its depth, without a capture around it.
+///
+/// Errors: those of a geometry file.
+#[doc(hidden)]
+pub fn check_scan(bytes: &[u8], name: &Path, camera: &Camera) -> Result<()> {
+    let placed = Placed::new(&read::read(bytes, name)?.thinned());
+    DepthMap::new(&depth::render(&placed, camera), camera);
+    Ok(())
+}
+
 /// The distance within which points of a thinned cloud are one: twice that of neighbours, the median of some.
 fn spacing(points: &[[f64; 3]]) -> f64 {
     const SOME: usize = 200;

@@ -62,7 +62,7 @@ pub use depth::{DepthFile, DepthKind};
 pub(crate) use depth::{DepthFit, read as depth_map};
 pub use evidence::{Agreement, PoseCheck};
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
-pub use geometry::Geometry;
+pub use geometry::{Geometry, check_scan};
 pub use lens::Distortion;
 pub use n3dv::{about_rows, rows_of};
 pub use options::{
