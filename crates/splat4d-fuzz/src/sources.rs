@@ -81,6 +81,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("run/chunks/shared.rs", By(&["scene", "safetensors"])),
     ("run/corrected.rs", By(&["refined_json"])),
     ("run/flows.rs", Not("compared with a mark")),
+    ("run/follow/about.rs", By(&["follow_plan"])),
     ("run/follow/mod.rs", By(&["follow_plan", "recipe"])),
     ("run/follow/record.rs", By(&["follow_frame"])),
     ("run/info.rs", By(&["run_json"])),

@@ -11,7 +11,7 @@ settings! {
         /// Training steps of the first frame.
         first_steps: usize = 3000 => at_least(1).unit("iterations");
         /// Training steps of every later frame.
-        frame_steps: usize = 200 => at_least(1).unit("iterations");
+        frame_steps: usize = 300 => at_least(1).unit("iterations");
         /// A tile of an image disagrees with the scene where its mean absolute error rises by more than this (colours
         /// from 0 to 1).
         changed: f64 = 0.008 => positive();

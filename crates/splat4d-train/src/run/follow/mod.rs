@@ -8,6 +8,7 @@
 //! which Gaussians learn is decided by images, in the spirit of the gates of QUEEN (Girish et al. 2024). The selection
 //! by tiles and weights is ours.
 
+mod about;
 mod arrival;
 mod changed;
 mod fit;
@@ -22,12 +23,13 @@ use super::checkpoint::write_atomically;
 use super::identity::{fingerprint, recipe_print};
 use super::info::{ELSEWHERE, elsewhere, read_text};
 use super::open::{OpenCapture, capture_options, open_frames};
-use super::{peak_memory, points};
+use super::points;
 use crate::capture::{Capture, CaptureOptions, Lenses, growing_root};
 use crate::event::{Event, FollowedFrame};
 use crate::path_text::{of_text, to_text};
 use crate::recipe::Recipe;
 use crate::{Error, Result};
+use about::{check, read_plan};
 use changed::{Comparison, TileErrors};
 use fit::{Fit, drive, first_recipe, first_record};
 use history::History;
@@ -48,10 +50,6 @@ const FOLDER: &str = "frames";
 const PLAN: &str = "follow.json";
 /// The recipe, in the run and as it was requested in the folder of the frames.
 const RECIPE: &str = "recipe.toml";
-/// The verb that made the run.
-const MADE_BY: &str = "train --follow";
-/// The motion model of the pages of a playback file, which become the run's scene.
-const PLAYED: &str = "spacetime";
 
 /// A capture that is followed into a run folder.
 pub struct Following {
@@ -354,31 +352,6 @@ impl Following {
         }
     }
 
-    /// Errors: the cameras of a frame are not those of the first one, or it has images of other frames.
-    fn check_rig(&mut self, capture: &Capture) -> Result<()> {
-        let whole = capture.frames.len() == capture.cameras.len() && capture.fixed_cameras();
-        if !whole || capture.train.is_empty() {
-            return Err(Error::input("its frames cannot be read one by one").at(self.root.display()).remedy(
-                "Use at least two fixed cameras, and hold out cameras as a whole (option `hold_out` camera=0).",
-            ));
-        }
-        let rig: String = capture
-            .frames
-            .iter()
-            .map(|f| format!("{} {:?}\n", capture.cameras[f.camera].name, (&f.view.cam_from_world, &f.view.intrinsics)))
-            .collect();
-        let rig = super::identity::file_print(rig.as_bytes());
-        match &self.rig {
-            Some(first) if *first != rig => Err(Error::input("its cameras are not those of the first frame")
-                .at(self.root.join("capture.json").display())
-                .remedy("Put them back, or follow the capture into another folder.")),
-            _ => {
-                self.rig = Some(rig);
-                Ok(())
-            }
-        }
-    }
-
     /// The seconds of a frame on the scene clock.
     pub fn seconds(&self, frame: usize) -> f64 {
         let fps = self.state.as_ref().map_or(splat4d::scene::time::DEFAULT_FPS, |s| s.shell.fps);
@@ -414,27 +387,6 @@ impl Following {
     pub fn beginning(&self) -> Result<Arc<Capture>> {
         self.capture(self.first())
     }
-
-    /// Writes what makes the folder a run on the frames that were followed: `recipe.toml` and `run.json`.
-    /// `finished`: whether all is done.
-    pub fn write_info(&self, seconds: f64, finished: bool) -> Result<()> {
-        let frames = self.next - self.first();
-        let recipe = self.recipe.clone().with(|r| {
-            r.capture.max_frames = frames.max(1);
-            r.run.motion = crate::recipe::MotionName::of(PLAYED);
-        });
-        write_atomically(&self.run.join(RECIPE), recipe.to_toml().as_bytes())?;
-        let follow = &self.recipe.follow;
-        let steps = follow.first_steps + follow.frame_steps * frames.saturating_sub(1);
-        let info = json!({
-            "version": env!("CARGO_PKG_VERSION"), "made_by": MADE_BY, "capture": to_text(&self.root),
-            "capture_name": self.facts["name"], ELSEWHERE: self.facts[ELSEWHERE], "motion": "followed",
-            "seed": self.recipe.run.seed, "frames": frames, "iteration": steps, "seconds": seconds,
-            "gaussians": self.state.as_ref().map_or(0, |s| s.history.layer.params.len()),
-            "finished": finished, "peak_memory": peak_memory(),
-        });
-        write_atomically(&self.run.join("run.json"), format!("{info:#}\n").as_bytes())
-    }
 }
 
 /// Checks the file of a frame, whatever run it is of. Errors: it is damaged.
@@ -449,28 +401,4 @@ pub fn example_frame() -> Vec<u8> {
     let params = splat4d::scene::Params::new(2, 1, &[]);
     let record = Record { frame: 0, active: vec![0], params, origin: vec![0, history::NEW], ..Record::default() };
     record.bytes().expect("memory takes it")
-}
-
-/// The file of what is followed.
-fn read_plan(file: &Path) -> Result<Value> {
-    serde_json::from_str(&read_text(file)?).map_err(|e| {
-        Error::input(format!("it is not JSON: {e}")).at(file.display()).remedy("Follow the capture into another folder")
-    })
-}
-
-/// Errors: settings that a followed capture cannot have.
-fn check(recipe: &Recipe) -> Result<()> {
-    recipe.check()?;
-    let refined = recipe.refine.poses || recipe.refine.focal || recipe.refine.times;
-    let other = !recipe.run.motion.is_auto() && recipe.run.motion != crate::methods::still::NAME;
-    let (what, remedy) = if other && recipe.run.motion != PLAYED {
-        (format!("motion `{}`", recipe.run.motion), "Leave option `motion` out: Gaussians move from frame to frame.")
-    } else if refined {
-        ("cameras that are refined".to_owned(), "Refine them on an earlier capture of the same rig.")
-    } else if recipe.capture.observe < 1.0 {
-        ("an unobserved future (option `observe`)".to_owned(), "Leave option `observe` out.")
-    } else {
-        return Ok(());
-    };
-    Err(Error::new(crate::ErrorKind::Unsupported, format!("a capture cannot be followed with {what}")).remedy(remedy))
 }

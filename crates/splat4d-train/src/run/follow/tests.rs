@@ -29,7 +29,7 @@ impl Recorded {
     }
 
     /// Copies a frame's images of some cameras, which are old when they are looked at.
-    fn record(&self, frame: usize, cameras: std::ops::Range<usize>) {
+    fn record(&self, frame: usize, cameras: Range<usize>) {
         for camera in cameras {
             let to = self.image(camera, frame);
             std::fs::create_dir_all(to.parent().unwrap()).unwrap();
