@@ -194,7 +194,7 @@ fn images_that_a_device_keeps_are_loaded_once() {
     let line = "motion=spacetime strategy=none iterations=120 half_size_until=0.4";
     let Some((kept, mse, few)) = run(line) else { return };
     // One byte: every step sends its image.
-    let (sent, other_mse, all) = run(&format!("{line} device_images=1")).expect("there was a GPU");
+    let (sent, other_mse, all) = run(&format!("{line} run.device_images=1")).expect("there was a GPU");
     assert!(kept == sent && mse == other_mse, "it changes no bit");
     // Every frame in both sizes, and again in another stage.
     let frames = bed.frames().len();
