@@ -8,7 +8,7 @@ use crate::learnt::LEAST_TICKS;
 use crate::paths::{Moment, Paths, Pose};
 use crate::smooth::smooth;
 use crate::{Error, Result};
-use splat4d::layers::{Evaluation, Scene};
+use splat4d::layers::{Evaluation, FAR_SHELL, Scene};
 use splat4d::math::knn::{knn, mean_square_distance};
 use splat4d::math::mat3::procrustes;
 use splat4d::math::se3::{add, mat_vec, norm, sub};
@@ -60,7 +60,8 @@ fn snapshot(scene: &Scene<f32>, t: f64) -> Snapshot {
     let (mut x, mut alpha) = (Vec::new(), Vec::new());
     for layer in &scene.layers {
         let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::All, Time(t));
-        let (out, there) = (seen.tape(0).out(), layer.spans_over(Time(t)));
+        // A far shell is no part of the scene's size.
+        let (out, there) = (seen.tape(0).out(), layer.spans_over(Time(t)) && layer.name != FAR_SHELL);
         for row in 0..out.rows() {
             let mean = out.read::<3>(row, 0);
             let sound = there && mean.iter().all(|c| c.is_finite());

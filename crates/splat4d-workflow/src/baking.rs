@@ -12,7 +12,7 @@ use crate::paths::{Stage, View};
 use crate::run_folder::Run;
 use crate::sound;
 pub use crate::sound::SoundChoice;
-use crate::source::{Source, not_empty};
+use crate::source::{Source, Surroundings, not_empty};
 use serde_json::{Value, json};
 use splat4d::bake::{self, Bakery, Curve, Cut, Options, Shown};
 use splat4d::device;
@@ -225,7 +225,7 @@ impl Kitchen<'_> {
         }
         let antialias = self.source.antialias();
         let (stage, named) = (self.source.stage(self.views), distinct(self.views));
-        let meta = meta(scene, &Outline::of_baked(&baked), &stage, &named);
+        let meta = meta(scene, &Outline::of_baked(&baked, scene), &stage, &named);
         let poster = baking.poster.then(|| poster(scene, &stage, antialias)).flatten();
         console.phase("writing", 0, 0);
         let draft = Draft {
@@ -578,22 +578,22 @@ pub fn distinct(views: &[View]) -> Vec<&View> {
 pub struct Outline {
     pub clip: [f64; 2],
     pub sh_degree: usize,
-    /// Least and greatest corner of the means.
+    /// Least and greatest corner of the means, without those of a far shell.
     pub bounds: Option<[[f64; 3]; 2]>,
 }
 
 impl Outline {
-    fn of_baked(baked: &bake::Baked) -> Self {
+    fn of_baked(baked: &bake::Baked, scene: &Scene<f32>) -> Self {
         let means = baked.nodes.iter().flat_map(|n| &n.primitives).map(|p| p.mean);
-        Self { clip: baked.clip, sh_degree: baked.sh_degree, bounds: bounds(means) }
+        Self { clip: baked.clip, sh_degree: baked.sh_degree, bounds: bounds(means, scene) }
     }
 
-    /// Of pages that are to be written.
-    pub fn of_pages(pages: &Pages) -> Self {
+    /// Of pages of a scene that are to be written.
+    pub fn of_pages(pages: &Pages, scene: &Scene<f32>) -> Self {
         let tables = pages.layers.iter().map(|l| &l.params[GEOMETRY]);
         let means = tables.flat_map(|t| (0..t.rows()).map(|row| t.read::<3>(row, 0).map(f64::from)));
         let sh_degree = pages.palette.as_ref().map_or(0, |p| p.degree);
-        Self { clip: pages.meta.clip, sh_degree, bounds: bounds(means) }
+        Self { clip: pages.meta.clip, sh_degree, bounds: bounds(means, scene) }
     }
 }
 
@@ -628,9 +628,10 @@ pub fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: &[&View
     }
 }
 
-/// Least and greatest corner.
-fn bounds(means: impl Iterator<Item = [f64; 3]>) -> Option<[[f64; 3]; 2]> {
-    means.fold(None, |b: Option<[[f64; 3]; 2]>, m| {
+/// Least and greatest corner of the means that do not belong to the scene's far shell.
+fn bounds(means: impl Iterator<Item = [f64; 3]>, scene: &Scene<f32>) -> Option<[[f64; 3]; 2]> {
+    let near = Surroundings::of(scene);
+    means.filter(|m| near.is_none_or(|near| near.holds(*m))).fold(None, |b: Option<[[f64; 3]; 2]>, m| {
         let [low, high] = b.unwrap_or([m, m]);
         Some([std::array::from_fn(|k| low[k].min(m[k])), std::array::from_fn(|k| high[k].max(m[k]))])
     })

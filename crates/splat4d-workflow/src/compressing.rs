@@ -383,7 +383,7 @@ impl Work {
             console.stop_polled(SAVING);
             let compressed = self.compress(&original, stop, console)?;
             console.stop_not_polled(&self.kept());
-            let file = self.write_file(&compressed, console)?;
+            let file = self.write_file(&compressed, original.scene, console)?;
             let Some(before) = &before else { break (file, None) };
             let scene = read_scene(&self.dir.join("scene.safetensors"))?;
             let after = evaluating::scores(&self.dir, &scene, measure, stop, console)?;
@@ -595,7 +595,12 @@ impl Work {
     }
 
     /// Writes `scene.s4d`.
-    fn write_file(&self, compressed: &compress::Compressed, console: &dyn Listener) -> Result<Summary> {
+    fn write_file(
+        &self,
+        compressed: &compress::Compressed,
+        original: &Scene<f32>,
+        console: &dyn Listener,
+    ) -> Result<Summary> {
         console.phase("writing", 0, 0);
         let source = Source::open(&self.dir)?;
         let views = source.views()?;
@@ -603,7 +608,7 @@ impl Work {
         let pages = compressed.pages.as_ref().expect("the command's settings have a codec");
         let run = source.run.as_ref().expect("it was opened as a run");
         let antialias = run.recipe().is_ok_and(|r| r.appearance.antialias);
-        let outline = baking::Outline::of_pages(pages);
+        let outline = baking::Outline::of_pages(pages, original);
         let meta = Meta { title: run.name(), ..baking::meta(&source.scene, &outline, &stage, &cameras) };
         let poster = baking::poster(&source.scene, &stage, antialias);
         let draft = PagesDraft { meta: &meta, ..pages.draft(poster.as_deref()) };

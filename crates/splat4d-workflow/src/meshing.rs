@@ -13,7 +13,7 @@ use crate::exporting::Frames;
 use crate::files::{self, either, grouped};
 use crate::run_folder::Run;
 use crate::sequence::{self, Pattern};
-use crate::source::{Source, not_empty};
+use crate::source::{Source, Surroundings, not_empty};
 use depth::{columns, in_grid, in_world, inverses, map, views};
 use fusion::Shell;
 pub use mesh::Mesh;
@@ -110,6 +110,8 @@ pub struct Mesher<'a> {
     options: MeshOptions,
     config: RenderConfig,
     grid_from_world: [[f64; 3]; 3],
+    /// Where surfaces can be; none: everywhere.
+    near: Option<Surroundings>,
 }
 
 impl<'a> Mesher<'a> {
@@ -131,7 +133,8 @@ impl<'a> Mesher<'a> {
         let player = Player::of_scene(&source.scene);
         let centers = source.run.as_ref().is_some_and(trained_with_depth);
         let config = RenderConfig { antialias: antialias(source.antialias()), ..RenderConfig::default() };
-        Ok(Self { player, cameras, centers, options: *options, config, grid_from_world })
+        let near = Surroundings::of_source(source);
+        Ok(Self { player, cameras, centers, options: *options, config, grid_from_world, near })
     }
 
     /// Where the surfaces are seen from, in words.
@@ -151,7 +154,7 @@ impl<'a> Mesher<'a> {
     pub fn at(&mut self, time: f64) -> Result<Mesh> {
         let (options, turn) = (self.options, self.grid_from_world);
         let splats = self.player.at(Time(time))?;
-        let Some(bounds) = bounds(&splats, &turn) else { return Ok(Mesh::default()) };
+        let Some(bounds) = bounds(&splats, &turn, self.near) else { return Ok(Mesh::default()) };
         let side = (0..3).map(|k| bounds[1][k] - bounds[0][k]).fold(0.0, f64::max);
         if options.voxel * LEAST_VOXELS > side {
             return Err(Error::input(format!(
@@ -198,12 +201,13 @@ fn trained_with_depth(run: &Run) -> bool {
 
 const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
-/// The box of all centres but the outermost, in the axes of the grid; `None` where there is none.
-fn bounds(splats: &Splats<'_>, grid_from_world: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 2]> {
+/// The box of all centres but the outermost and those of a far shell, in the axes of the grid; `None` where there is none.
+fn bounds(splats: &Splats<'_>, grid_from_world: &[[f64; 3]; 3], near: Option<Surroundings>) -> Option<[[f64; 3]; 2]> {
     let rows = splats.parts.iter().flat_map(|part| (0..part.out.rows()).map(move |row| (part.out, row)));
     let shown = rows.filter(|(out, row)| out.get(*row, SPLAT_OPACITY) >= LEAST_OPACITY);
-    let means = shown.map(|(out, row)| mat_vec(grid_from_world, out.read::<3>(row, 0).map(f64::from)));
-    let means: Vec<[f64; 3]> = means.filter(|m| m.iter().all(|x| x.is_finite())).collect();
+    let means = shown.map(|(out, row)| out.read::<3>(row, 0).map(f64::from));
+    let means = means.filter(|m| m.iter().all(|x| x.is_finite()) && near.is_none_or(|near| near.holds(*m)));
+    let means: Vec<[f64; 3]> = means.map(|m| mat_vec(grid_from_world, m)).collect();
     if means.is_empty() {
         return None;
     }

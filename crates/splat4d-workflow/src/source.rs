@@ -11,7 +11,7 @@ use crate::sound;
 use splat4d::format::playback::{self, Index, Kind, Provenance, Sound};
 use splat4d::format::ply::PlyInfo;
 use splat4d::format::{Dialect, Warnings, dialect, foreign, sog};
-use splat4d::layers::{Layer, Scene};
+use splat4d::layers::{FAR_SHELL, Layer, Scene};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, ErrorKind, Result, format};
@@ -319,9 +319,50 @@ pub fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// All means that are numbers.
+/// All means that are numbers, but for those of the far shell.
 fn means(scene: &Scene<f32>) -> Vec<[f64; 3]> {
-    scene.layers.iter().flat_map(Layer::means).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+    let near = scene.layers.iter().filter(|l| l.name != FAR_SHELL);
+    near.flat_map(Layer::means).filter(|m| m.iter().all(|x| x.is_finite())).collect()
+}
+
+/// Least and greatest coordinate of all means but the outermost.
+fn sides(means: &[[f64; 3]]) -> [[f64; 2]; 3] {
+    std::array::from_fn(|k| {
+        let mut values: Vec<f64> = means.iter().map(|m| m[k]).collect();
+        values.sort_by(f64::total_cmp);
+        let out = (values.len() as f64 * BEYOND) as usize;
+        [values[out], values[values.len() - 1 - out]]
+    })
+}
+
+/// Where a scene's Gaussians are, without a far shell: a box and as much around it as it is long.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Surroundings([[f64; 2]; 3]);
+
+impl Surroundings {
+    /// Of a scene in memory; `None`: it has no far shell.
+    pub(crate) fn of(scene: &Scene<f32>) -> Option<Self> {
+        let means = means(scene);
+        let shell = scene.layers.iter().any(|l| l.name == FAR_SHELL);
+        (shell && !means.is_empty()).then(|| Self::around(sides(&means)))
+    }
+
+    /// The same of a file: a playback file states the box of what is near.
+    pub(crate) fn of_source(source: &Source) -> Option<Self> {
+        let stated = source.playback.as_ref().and_then(|index| index.meta.bounds);
+        let stated = stated.map(|[low, high]| Self::around([0, 1, 2].map(|k| [low[k], high[k]])));
+        Self::of(&source.scene).or(stated)
+    }
+
+    fn around(sides: [[f64; 2]; 3]) -> Self {
+        let longest = sides.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
+        Self(sides.map(|[low, high]| [low - longest, high + longest]))
+    }
+
+    /// Whether a position is in it.
+    pub(crate) fn holds(&self, x: [f64; 3]) -> bool {
+        (0..3).all(|k| (self.0[k][0]..=self.0[k][1]).contains(&x[k]))
+    }
 }
 
 /// Middle and half the diagonal of the box of all means but the outermost.
@@ -330,12 +371,7 @@ fn inner_box(scene: &Scene<f32>) -> ([f64; 3], f64) {
     if means.is_empty() {
         return ([0.0; 3], 1.0);
     }
-    let sides: [[f64; 2]; 3] = std::array::from_fn(|k| {
-        let mut values: Vec<f64> = means.iter().map(|m| m[k]).collect();
-        values.sort_by(f64::total_cmp);
-        let out = (values.len() as f64 * BEYOND) as usize;
-        [values[out], values[values.len() - 1 - out]]
-    });
+    let sides = sides(&means);
     let half = sides.map(|[low, high]| 0.5 * (high - low));
     (sides.map(|[low, high]| 0.5 * (low + high)), ROOM * splat4d::math::se3::norm(half).max(1e-6))
 }

@@ -45,7 +45,7 @@ const MATTERS: f64 = 0.005;
 
 /// Evidence of the images about one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Support {
+pub(crate) struct Support {
     /// Training cameras whose images it changes.
     pub seen: u32,
     /// Training cameras that would miss it.
@@ -76,7 +76,7 @@ impl Support {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Judged {
     /// By layer and Gaussian.
-    pub support: Vec<Vec<Support>>,
+    pub(crate) support: Vec<Vec<Support>>,
     /// Σ (I − T)² over the images of the median training camera.
     pub error: f64,
 }

@@ -7,13 +7,12 @@
 //! the points seen around it (1/z of a plane is affine in pixels).
 
 use super::Seeds;
-use super::sky::Sky;
+use super::sky::{FOREGROUND, Sky, views};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::mat3;
 use splat4d::scene::Camera;
-use std::collections::HashSet;
 
 /// Points that a plane is laid through.
 const NEIGHBOURS: usize = 12;
@@ -27,8 +26,6 @@ const RIDGE: f64 = 0.05;
 const BORDER: f64 = 0.15;
 /// Views that are covered, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Foreground in the masks moves: other points represent it.
-pub(super) const FOREGROUND: f32 = 0.5;
 
 /// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them, and none before
 /// the `sky`, where there are no surfaces between points.
@@ -59,7 +56,8 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize, sky
             .into_par_iter()
             .map(|k| {
                 let [u, v] = at(k);
-                let left_out = blocked(u as usize, v as usize) || far.as_ref().is_some_and(|far| far([u, v]));
+                let color = || std::array::from_fn(|c| picture.color.get(c, v as usize, u as usize));
+                let left_out = blocked(u as usize, v as usize) || far.as_ref().is_some_and(|far| far([u, v], color()));
                 (!left_out).then(|| depth(&seen, [u, v]))
             })
             .collect();
@@ -72,18 +70,6 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize, sky
         }
     }
     Ok(out)
-}
-
-/// One image of every fixed camera, and of every position of moving ones; at most so many, evenly chosen.
-pub(super) fn views(frames: &dyn Frames, most: usize) -> Vec<usize> {
-    let mut places = HashSet::new();
-    let new = |&i: &usize| {
-        let pose = &frames.camera(i).cam_from_world;
-        places.insert((pose.rotation.map(|row| row.map(f64::to_bits)), pose.translation.map(f64::to_bits)))
-    };
-    let all: Vec<usize> = (0..frames.len()).filter(new).collect();
-    let count = all.len().min(most);
-    (0..count).map(|k| all[k * all.len() / count]).collect()
 }
 
 /// A point in an image: pixel and inverse depth.

@@ -14,9 +14,9 @@ pub(crate) mod volume;
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
 use crate::methods::{InitialMotion, Method, TrainContext};
-use crate::settings::{Value, among, choices, settings};
+use crate::settings::{Value, among, settings};
 use crate::{Error, Result};
-use sky::Sky;
+pub use shell::FarShell;
 use splat4d::layers::{Head, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::math::knn::mean_square_distance;
@@ -122,25 +122,6 @@ settings! {
             => any().when(All(&[IsNot("run.motion", &["tracked"]), IsNot("densify.strategy", &["mcmc"])]));
         /// Distance of the far shell from the cameras' centre; 0: where the images agree best.
         shell_distance: f64 = 0.0 => any().unit("extents").when(Is("init.shell", &["auto", "on"]));
-    }
-}
-
-choices! {
-    /// Whether a scene has a far shell.
-    pub enum FarShell {
-        /// If images fit a far distance where they show no near points.
-        Auto = "auto",
-        /// Yes.
-        On = "on",
-        /// No.
-        Off = "off",
-    }
-}
-
-impl InitSettings {
-    /// The distance of the far shell, extents; `None`: there is none, or whether there is one has not been decided.
-    pub(crate) fn shell_at(&self) -> Option<f64> {
-        (self.shell == FarShell::On && self.shell_distance > 0.0).then_some(self.shell_distance)
     }
 }
 
@@ -270,18 +251,7 @@ pub fn seeds(
     if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
     }
-    let sky = match plan.shell {
-        Some(distance) => {
-            let still: Vec<[f64; 3]> =
-                (0..out.len()).filter(|&i| out.times[i].is_none()).map(|i| out.points[i]).collect();
-            let mut sky = Sky::open(frames, &still, plan.center, plan.extent)?;
-            sky.mark(distance * plan.extent);
-            // Points before it are matches of what repeats or of noise.
-            out.retain(|i, s| s.times[i].is_some() || !sky.hides(s.points[i]));
-            Some(sky)
-        }
-        None => None,
-    };
+    let sky = shell::before(plan, frames, &mut out)?;
     if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         let filled = matches!(settings.source, Source::Auto | Source::Pictures);
         if filled && !have_depth && out.len() < count {

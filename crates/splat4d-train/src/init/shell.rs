@@ -3,7 +3,11 @@
 //! distance.
 
 use super::sky::Sky;
+use super::{InitSettings, Seeds};
+use crate::Result;
+use crate::capture::frames::Frames;
 use crate::methods::TrainContext;
+use crate::settings::choices;
 use rayon::prelude::*;
 use splat4d::layers::{FAR_SHELL, Layer};
 use splat4d::math::se3::dot;
@@ -26,6 +30,39 @@ const WIDTH: f64 = 0.6;
 const OPACITY_START: f64 = 0.9;
 /// Cells beside the visible surroundings that it covers as well: behind the outlines of what is near.
 const BEHIND: f64 = 2.0;
+
+choices! {
+    /// Whether a scene has a far shell.
+    pub enum FarShell {
+        /// If images fit a far distance where they show no near points.
+        Auto = "auto",
+        /// Yes.
+        On = "on",
+        /// No.
+        Off = "off",
+    }
+}
+
+impl InitSettings {
+    /// The distance of the far shell, extents; `None`: there is none, or whether there is one has not been decided.
+    pub(crate) fn shell_at(&self) -> Option<f64> {
+        (self.shell == FarShell::On && self.shell_distance > 0.0).then_some(self.shell_distance)
+    }
+}
+
+/// The surroundings at the plan's distance. Seeds before them are removed: they are matches of what repeats, or of noise.
+/// `None`: the plan has no shell.
+///
+/// Errors: an image cannot be read.
+pub(super) fn before(plan: &TrainContext, frames: &dyn Frames, seeds: &mut Seeds) -> Result<Option<Sky>> {
+    let Some(distance) = plan.shell else { return Ok(None) };
+    let still: Vec<[f64; 3]> =
+        (0..seeds.len()).filter(|&i| seeds.times[i].is_none()).map(|i| seeds.points[i]).collect();
+    let mut sky = Sky::open(frames, &still, plan.center, plan.extent)?;
+    sky.mark(distance * plan.extent);
+    seeds.retain(|i, s| !sky.hides(s.points[i]));
+    Ok(Some(sky))
+}
 
 /// The first Gaussians of the shell.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -5,11 +5,16 @@
 //! growing radius around the cameras: a wall without texture fits best where it is, a sky and a far landscape fit far
 //! away.
 
+mod view;
+
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
+use splat4d::math::median;
 use splat4d::math::se3::{dot, norm, sub};
-use splat4d::scene::{Camera, Planes};
+use splat4d::scene::Camera;
+use view::{Cell, SAMPLES, View, cell, grid, occupied};
+pub(super) use view::{FOREGROUND, views};
 
 /// Views that are examined at most, evenly chosen.
 const VIEWS: usize = 40;
@@ -18,10 +23,8 @@ const VIEWS: usize = 40;
 const LONGEST_SIDE: usize = 480;
 /// Images whose longer side is shorter have too few pixels in a cell.
 pub(crate) const SHORTEST_SIDE: usize = 128;
-/// Cells along an image's longer side.
-const CELLS: f64 = 32.0;
 /// Points nearer than this to the cameras' centre occupy their cells, units ([`Sky::unit`]).
-const NEAR: f64 = 5.0;
+const NEAR: f64 = 10.0;
 /// Radii that a wall would have, and those of far surroundings, units. From the last on, the parallax between cameras is
 /// below a pixel of an image of 1,000 pixels.
 const NEAR_RADII: [f64; 5] = [1.0, 1.5, 2.0, 3.0, 4.0];
@@ -36,36 +39,21 @@ const AGREES: f64 = 0.06;
 /// largest. A walk outdoors has 0.75, a synthetic sky less, a room 1.5 (`studies/records/2026-11-28-far-shell.md`).
 const BETTER: f64 = 0.85;
 const LARGEST_ERROR: f64 = 0.12;
+/// A cell with near points shows the surroundings all the same, and the points are wrong matches, if so many images at
+/// least agree there, and their median difference is at most this share of that at the best near radius.
+const WITNESSES: usize = 3;
+const MUCH_BETTER: f64 = 0.5;
+/// Other times at which images of a fixed camera are examined, and the mean difference of colour from which on a cell
+/// moves.
+const TIMES: usize = 2;
+const CHANGED: f32 = 0.04;
 /// Share of the images without near points, and comparisons, from which far surroundings are looked for.
 const OPEN: f64 = 0.05;
 const PAIRS: usize = 200;
-/// Samples of a cell: 3x3.
-const SAMPLES: usize = 9;
-
-/// What an image shows in a cell.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Cell {
-    /// A point that is near, or something that moves.
-    Near,
-    /// No near point.
-    Open,
-    /// The far surroundings.
-    Sky,
-}
-
-/// An examined image.
-struct View {
-    camera: Camera,
-    center: [f64; 3],
-    color: Planes<f32>,
-    grid: [usize; 2],
-    cells: Vec<Cell>,
-}
 
 /// The far surroundings as images show them.
 pub(crate) struct Sky {
     views: Vec<View>,
-    near: Vec<[f64; 3]>,
     center: [f64; 3],
     /// Length in which distances are stated, scene units: the cameras' extent, or the distance of the nearest quarter of
     /// the points where that is more (cameras that hardly move).
@@ -116,65 +104,6 @@ impl Look {
     }
 }
 
-impl View {
-    fn place(&self, cell: usize) -> [f64; 2] {
-        [(cell % self.grid[0]) as f64, (cell / self.grid[0]) as f64]
-    }
-
-    /// The samples of a cell, pixels; the fifth is its centre.
-    fn samples(&self, cell: usize) -> [[f64; 2]; SAMPLES] {
-        let [x, y] = self.place(cell);
-        let size = [self.camera.width, self.camera.height].map(|n| n as f64);
-        std::array::from_fn(|k| {
-            let at = [x, y, (k % 3) as f64, (k / 3) as f64];
-            [0, 1].map(|a| (at[a] + (at[2 + a] + 0.5) / 3.0) * size[a] / self.grid[a] as f64)
-        })
-    }
-
-    fn cell(&self, pixel: [f64; 2]) -> Option<usize> {
-        cell(&self.camera, self.grid, pixel)
-    }
-
-    /// The colour at a pixel position in the image, bilinear.
-    fn color(&self, pixel: [f64; 2]) -> [f32; 3] {
-        let [w, h] = [self.color.width, self.color.height];
-        let at = |p: f64, n: usize| {
-            let x = (p - 0.5).clamp(0.0, (n - 1) as f64);
-            let low = (x as usize).min(n.saturating_sub(2));
-            (low, (low + 1).min(n - 1), (x - low as f64) as f32)
-        };
-        let ((x0, x1, a), (y0, y1, b)) = (at(pixel[0], w), at(pixel[1], h));
-        std::array::from_fn(|c| {
-            let row = |y: usize| self.color.get(c, y, x0) * (1.0 - a) + self.color.get(c, y, x1) * a;
-            row(y0) * (1.0 - b) + row(y1) * b
-        })
-    }
-}
-
-fn cell(camera: &Camera, grid: [usize; 2], pixel: [f64; 2]) -> Option<usize> {
-    let size = [camera.width, camera.height];
-    let [x, y] = [0, 1].map(|a| pixel[a] / size[a] as f64 * grid[a] as f64);
-    let inside = x >= 0.0 && y >= 0.0 && x < grid[0] as f64 && y < grid[1] as f64;
-    inside.then(|| y as usize * grid[0] + x as usize)
-}
-
-fn grid(camera: &Camera) -> [usize; 2] {
-    let side = camera.width.max(camera.height) as f64 / CELLS;
-    [camera.width, camera.height].map(|n| (n as f64 / side).round().max(1.0) as usize)
-}
-
-/// Whether each cell of a camera's image has a near point in it or next to it.
-fn occupied(camera: &Camera, grid: [usize; 2], near: &[[f64; 3]]) -> Vec<bool> {
-    let mut out = vec![false; grid[0] * grid[1]];
-    for k in near.iter().filter_map(|&x| cell(camera, grid, camera.project(x)?.0)) {
-        let around = |at: usize, n: usize| at.saturating_sub(1)..=(at + 1).min(n - 1);
-        for y in around(k / grid[0], grid[1]) {
-            around(k % grid[0], grid[0]).for_each(|x| out[y * grid[0] + x] = true);
-        }
-    }
-    out
-}
-
 impl Sky {
     /// Reads images and finds cells without near points; the radius is not known yet. `center`, `extent`: of the
     /// cameras. Errors: an image cannot be read.
@@ -183,7 +112,7 @@ impl Sky {
         distances.sort_by(f64::total_cmp);
         let unit = distances.get(distances.len() / 4).map_or(extent, |d| d.max(extent));
         let near: Vec<[f64; 3]> = points.iter().copied().filter(|&x| norm(sub(x, center)) < NEAR * unit).collect();
-        let chosen = super::fill::views(frames, VIEWS);
+        let chosen = views(frames, VIEWS);
         let mut views = Vec::new();
         let mut picture = Picture::default();
         for i in chosen {
@@ -194,21 +123,28 @@ impl Sky {
                 camera = camera.downscaled(2);
             }
             let grid = grid(&camera);
-            let mut busy = occupied(&camera, grid, &near);
-            // What moves, and what the lens never filled.
+            let busy = occupied(&camera, grid, &near);
+            let mut cells: Vec<Cell> = busy.into_iter().map(|b| if b { Cell::Near } else { Cell::Open }).collect();
             let [w, h] = [camera.width, camera.height];
-            let moves = |p: usize| picture.mask.as_ref().is_some_and(|m| m.data[p] > super::fill::FOREGROUND);
+            let moves = |p: usize| picture.mask.as_ref().is_some_and(|m| m.data[p] > FOREGROUND);
             let empty = |p: usize| picture.weight.as_ref().is_some_and(|m| m.data[p] == 0.0);
             for p in (0..w * h).filter(|&p| moves(p) || empty(p)) {
                 if let Some(k) = cell(&camera, grid, [(p % w) as f64 + 0.5, (p / w) as f64 + 0.5]) {
-                    busy[k] = true;
+                    cells[k] = Cell::Moving;
                 }
             }
-            let cells = busy.into_iter().map(|b| if b { Cell::Near } else { Cell::Open }).collect();
             let center = camera.center();
             views.push(View { camera, center, color: picture.color.clone(), grid, cells });
+            let view = views.last_mut().expect("just added");
+            for other in later(frames, i) {
+                frames.load(other, &mut picture)?;
+                while picture.color.width.max(picture.color.height) > LONGEST_SIDE {
+                    picture.halve();
+                }
+                view.changed(&picture.color, CHANGED);
+            }
         }
-        Ok(Self { views, near, center, unit, radius: 0.0 })
+        Ok(Self { views, center, unit, radius: 0.0 })
     }
 
     /// The point of a sphere around the centre that a camera sees at a pixel position; `None`: it is outside of it.
@@ -221,9 +157,15 @@ impl Sky {
         (c < 0.0).then(|| std::array::from_fn(|k| eye[k] + s * ray[k]))
     }
 
-    /// Mean difference of colour between a view's cell and every other image that shows the same of a sphere in a cell
-    /// without near points.
-    fn differences(&self, view: usize, cell: usize, radius: f64, mut found: impl FnMut(f64)) {
+    /// Mean difference of colour between a view's cell and every other image that shows the same of a sphere in cells that
+    /// `counts` holds for.
+    fn differences(
+        &self,
+        (view, cell): (usize, usize),
+        radius: f64,
+        counts: impl Fn(Cell) -> bool,
+        mut found: impl FnMut(f64),
+    ) {
         let own = &self.views[view];
         let samples = own.samples(cell);
         let mut there = [[0.0; 3]; SAMPLES];
@@ -235,8 +177,8 @@ impl Sky {
         for other in self.views.iter().enumerate().filter(|(k, _)| *k != view).map(|(_, v)| v) {
             let pixels = there.map(|x| other.camera.project(x).map(|(pixel, _)| pixel));
             let cells = pixels.map(|p| p.and_then(|p| other.cell(p)));
-            let open = |k: &Option<usize>| k.is_some_and(|k| other.cells[k] != Cell::Near);
-            if !cells.iter().all(open) {
+            let counting = |k: &Option<usize>| k.is_some_and(|k| counts(other.cells[k]));
+            if !cells.iter().all(counting) {
                 continue;
             }
             let apart = |k: usize| {
@@ -247,22 +189,45 @@ impl Sky {
         }
     }
 
-    /// Cells of all views without near points: view and cell.
-    fn open_cells(&self) -> Vec<(usize, usize)> {
+    /// Cells of all views for which the rule holds: view and cell.
+    fn cells(&self, rule: impl Fn(Cell) -> bool) -> Vec<(usize, usize)> {
         let of = |(v, view): (usize, &View)| (0..view.cells.len()).map(move |k| (v, k)).collect::<Vec<_>>();
         let all = self.views.iter().enumerate().flat_map(of);
-        all.filter(|&(v, k)| self.views[v].cells[k] != Cell::Near).collect()
+        all.filter(|&(v, k)| rule(self.views[v].cells[k])).collect()
+    }
+
+    /// Marks cells whose near points are wrong: there the images agree at a radius (scene units) and nowhere near.
+    fn clear(&mut self, radius: f64) {
+        let seen = |c: Cell| c != Cell::Moving;
+        let middle = |at: (usize, usize), radius: f64| {
+            let mut all = Vec::new();
+            self.differences(at, radius, seen, |d| all.push(d));
+            let enough = all.len() >= WITNESSES;
+            median(&mut all).filter(|_| enough)
+        };
+        let wrong = |at: &(usize, usize)| {
+            let Some(far) = middle(*at, radius).filter(|far| *far <= AGREES) else { return false };
+            let near = NEAR_RADII.iter().filter_map(|r| middle(*at, r * self.unit));
+            far <= MUCH_BETTER * near.fold(LARGEST_DIFFERENCE, f64::min)
+        };
+        let near = self.cells(|c| c == Cell::Near);
+        let wrong: Vec<bool> = near.par_iter().map(wrong).collect();
+        for ((v, k), _) in near.into_iter().zip(wrong).filter(|(_, wrong)| *wrong) {
+            self.views[v].cells[k] = Cell::Open;
+        }
     }
 
     /// Finds the radius at which images agree best, and the cells that show what is there.
     pub(crate) fn fit(&mut self) -> Evidence {
-        let open = self.open_cells();
+        let open = self.cells(is_open);
         let cells: usize = self.views.iter().map(|v| v.cells.len()).sum();
         let error = |radius: f64| -> (f64, usize) {
             // Sums of a cell in order, and cells in order: the same with any number of threads.
             let of = |&(v, k): &(usize, usize)| {
                 let mut sum = (0.0, 0);
-                self.differences(v, k, radius * self.unit, |d| sum = (sum.0 + d.min(LARGEST_DIFFERENCE), sum.1 + 1));
+                self.differences((v, k), radius * self.unit, is_open, |d| {
+                    sum = (sum.0 + d.min(LARGEST_DIFFERENCE), sum.1 + 1)
+                });
                 sum
             };
             let sums: Vec<(f64, usize)> = open.par_iter().map(of).collect();
@@ -279,19 +244,22 @@ impl Sky {
     }
 
     /// Marks the cells that show the surroundings at this distance, scene units: those in which most of the other images
-    /// agree, and those without a comparison that continue them.
+    /// agree, and those without a comparison that continue them. Where nothing can be compared at all, all cells without
+    /// near points.
     pub(crate) fn mark(&mut self, radius: f64) {
-        let open = self.open_cells();
+        self.clear(radius);
+        let open = self.cells(is_open);
         let agreement = |&(v, k): &(usize, usize)| {
             let mut count = [0usize; 2];
-            self.differences(v, k, radius, |d| count[usize::from(d <= AGREES)] += 1);
+            self.differences((v, k), radius, is_open, |d| count[usize::from(d <= AGREES)] += 1);
             count
         };
         let counts: Vec<[usize; 2]> = open.par_iter().map(agreement).collect();
+        let nothing = counts.iter().all(|c| *c == [0, 0]);
         let mut unknown = Vec::new();
         for (&(v, k), [no, yes]) in open.iter().zip(counts) {
             let cell = &mut self.views[v].cells[k];
-            *cell = if yes > 0 && yes >= no { Cell::Sky } else { Cell::Open };
+            *cell = if nothing || yes > 0 && yes >= no { Cell::Sky } else { Cell::Open };
             if yes + no == 0 {
                 unknown.push((v, k));
             }
@@ -340,7 +308,7 @@ impl Sky {
             let Some((pixel, _)) = view.camera.project(x) else { continue };
             let Some(cell) = view.cell(pixel) else { continue };
             look.seen += 1;
-            look.open += usize::from(view.cells[cell] != Cell::Near);
+            look.open += usize::from(is_open(view.cells[cell]));
             if view.cells[cell] == Cell::Sky {
                 look.sky += 1;
                 let color = view.color(pixel);
@@ -357,16 +325,32 @@ impl Sky {
         look.sky > 0 && 2 * look.sky > look.seen
     }
 
-    /// A test of pixels of any camera: whether the surroundings are there.
-    pub(crate) fn of_camera<'a>(&'a self, camera: &'a Camera) -> impl Fn([f64; 2]) -> bool + Sync + 'a {
-        let grid = grid(camera);
-        let (busy, eye) = (occupied(camera, grid, &self.near), camera.center());
-        move |pixel| {
-            let open = cell(camera, grid, pixel).is_some_and(|k| !busy[k]);
-            open && self.beyond(camera, eye, pixel, self.radius).is_some_and(|x| self.look(x).is_sky())
+    /// A test of pixels of any camera and their colours: whether the surroundings are there.
+    pub(crate) fn of_camera<'a>(&'a self, camera: &'a Camera) -> impl Fn([f64; 2], [f32; 3]) -> bool + Sync + 'a {
+        let eye = camera.center();
+        move |pixel, color| {
+            let Some(x) = self.beyond(camera, eye, pixel, self.radius) else { return false };
+            let look = self.look(x);
+            let apart = (0..3).map(|c| f64::from((color[c] - look.color[c]).abs())).sum::<f64>() / 3.0;
+            look.is_sky() && apart <= AGREES
         }
     }
 }
 
+/// Whether a cell is without near points.
+fn is_open(cell: Cell) -> bool {
+    matches!(cell, Cell::Open | Cell::Sky)
+}
+
+/// Frames of the same camera in the same place at other times, evenly chosen.
+fn later(frames: &dyn Frames, first: usize) -> Vec<usize> {
+    let (rig, pose) = (frames.rig(first), &frames.camera(first).cam_from_world);
+    let all: Vec<usize> = (0..frames.len())
+        .filter(|&i| i != first && frames.rig(i) == rig && frames.camera(i).cam_from_world == *pose)
+        .collect();
+    let count = all.len().min(TIMES);
+    (1..=count).map(|k| all[k * all.len() / count - 1]).collect()
+}
+
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

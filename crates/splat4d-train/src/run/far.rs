@@ -23,6 +23,7 @@ pub(super) fn decided(opened: &OpenCapture, recipe: Recipe, listen: &mut dyn FnM
     if let Some(why) = impossible(opened, &recipe) {
         if asked == FarShell::On {
             listen(&Event::Warning { message: format!("there is no far shell (init.shell): {why}") });
+            return Ok(recipe.with(|r| r.init.shell = FarShell::Off));
         }
         return Ok(recipe);
     }

@@ -69,7 +69,8 @@ pub(crate) fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 /// time, where the lifespans are within the spec's bounds.
 ///
 /// Errors: the layer moves otherwise, along curves, turns, or its lifespan is not Gaussian; a spec out of its ranges.
-pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
+#[cfg_attr(not(test), expect(dead_code, reason = "tests compare the two models by it"))]
+pub(crate) fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
         Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {
             return Err(cannot("native4d does not support features", "Train with features=none"));

@@ -16,10 +16,9 @@ mod tests;
 
 pub use constant::Constant;
 pub(crate) use constant::HIDDEN;
-pub use convert::to_native4d;
-#[cfg(test)]
-pub(crate) use convert::to_spacetime;
 pub(crate) use convert::with_polynomial;
+#[cfg(test)]
+pub(crate) use convert::{to_native4d, to_spacetime};
 pub use evaluation::Evaluation;
 pub(crate) use evaluation::sweep;
 pub use freeze::{Gaussians, freeze, freeze_rows, moment};

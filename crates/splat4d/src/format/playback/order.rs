@@ -21,8 +21,44 @@ const TAILS: f64 = 3.0;
 const CELLS: f64 = (1u32 << 10) as f64;
 const _: () = assert!(MORTON_BITS >= 10);
 
+/// Gaussians farther from the middle than this many times the distance of the nearest quarter are in blocks of their own:
+/// a sky in the box of a block takes the bits of what is near.
+const FAR: f64 = 100.0;
+
 /// Sorts `rows` (indices into `primitives`) into the order of a page.
 pub(super) fn sort(rows: &mut [u32], primitives: &[Primitive], span: [f64; 2]) {
+    let near = near_first(rows, primitives);
+    let (near, far) = rows.split_at_mut(near);
+    sort_alike(near, primitives, span);
+    sort_alike(far, primitives, span);
+}
+
+/// Moves the far Gaussians behind the others, which fill whole blocks; returns how many these are. The farthest of them
+/// are with the far ones where a block would have both. Without far Gaussians nothing moves.
+fn near_first(rows: &mut [u32], primitives: &[Primitive]) -> usize {
+    if rows.len() <= BLOCK_GAUSSIANS {
+        return rows.len();
+    }
+    let place = |i: u32| primitives[i as usize].mean;
+    let middle: [f64; 3] = std::array::from_fn(|k| {
+        let mut all: Vec<f64> = rows.iter().map(|&i| place(i)[k]).collect();
+        let half = all.len() / 2;
+        *all.select_nth_unstable_by(half, f64::total_cmp).1
+    });
+    let distance = |i: u32| (0..3).map(|k| (place(i)[k] - middle[k]).powi(2)).sum::<f64>().sqrt();
+    let mut all: Vec<f64> = rows.iter().map(|&i| distance(i)).collect();
+    let quarter = all.len() / 4;
+    let limit = FAR * *all.select_nth_unstable_by(quarter, f64::total_cmp).1;
+    let near = rows.iter().filter(|&&i| distance(i) <= limit).count();
+    if near == rows.len() {
+        return near;
+    }
+    let near = near / BLOCK_GAUSSIANS * BLOCK_GAUSSIANS;
+    rows.sort_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)));
+    near
+}
+
+fn sort_alike(rows: &mut [u32], primitives: &[Primitive], span: [f64; 2]) {
     let n = rows.len().max(1) as f64;
     let mean: [f64; 3] = std::array::from_fn(|k| rows.iter().map(|&i| primitives[i as usize].mean[k]).sum::<f64>() / n);
     let variance = |k: usize| rows.iter().map(|&i| (primitives[i as usize].mean[k] - mean[k]).powi(2)).sum::<f64>() / n;

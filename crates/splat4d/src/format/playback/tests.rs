@@ -235,6 +235,44 @@ fn a_block_is_alive_whenever_one_of_its_gaussians_is_seen() {
     assert!(dead * 20 > total, "the order makes blocks that can be culled by life: {dead} of {total}");
 }
 
+/// Errors of the means of the first `n` Gaussians of a page after encoding, scene units, the largest first.
+fn errors_of_means(primitives: &[Primitive], n: usize) -> Vec<f64> {
+    let mut order: Vec<u32> = (0..primitives.len() as u32).collect();
+    order::sort(&mut order, primitives, [0.0, 1.0]);
+    let rows: Vec<_> = order.iter().map(|&i| (&primitives[i as usize], 0)).collect();
+    let page = through(&rows, [0.0, 1.0]);
+    let error = |row: usize| {
+        let (mean, coded) = (rows[row].0.mean, page.record(row).mean);
+        (0..3).map(|k| (mean[k] - coded[k]).abs()).fold(0.0, f64::max)
+    };
+    let near = (0..rows.len()).filter(|&row| (order[row] as usize) < n);
+    let mut errors: Vec<f64> = near.map(error).collect();
+    errors.sort_by(|a, b| b.total_cmp(a));
+    errors
+}
+
+#[test]
+fn a_far_shell_takes_no_bits_from_what_is_near() {
+    let rng = Rng::new(4, "shell", 0);
+    let still = |i: usize| {
+        let rest = [0.0; 3];
+        let p = primitive(rng.fork(i as u64));
+        Primitive { half_width: f64::INFINITY, center: 0.5, velocity: rest, turn: rest, ..p }
+    };
+    let far = |i: usize| {
+        let p = still(i);
+        let size = p.mean.iter().map(|x| x * x).sum::<f64>().sqrt();
+        Primitive { mean: p.mean.map(|x| 2000.0 * x / size), scales: [30.0; 3], ..p }
+    };
+    // As many near ones as fill their blocks, and a few more: those share a block with far ones.
+    for (n, mixed) in [(12 * 256, 0), (12 * 256 + 100, 100)] {
+        let near: Vec<Primitive> = (0..n).map(still).collect();
+        let both: Vec<Primitive> = near.iter().cloned().chain((n..n + 1500).map(far)).collect();
+        let (alone, together) = (errors_of_means(&near, n), errors_of_means(&both, n));
+        assert!(together[mixed] <= 1.1 * alone[0], "{n}: {} against {}", together[mixed], alone[0]);
+    }
+}
+
 /// An image from in front at time t.
 fn picture(scene: &Scene<f32>, t: f64) -> Vec<f32> {
     let camera = Camera::with_fov_y(Se3::look_at([0.5, -1.0, -4.0], [0.0; 3], scene.up), 0.8, 96, 80);
