@@ -116,7 +116,7 @@ fn choices_round_trip_and_wrong_ones_get_a_suggestion() {
             assert!(error.contains(&format!("did you mean `{first}`")), "{error}");
         }
     }
-    assert_eq!(Recipe::settings().iter().filter(|k| !k.choices.is_empty()).count(), 20);
+    assert_eq!(Recipe::settings().iter().filter(|k| !k.choices.is_empty()).count(), 21);
     for (set, back) in [("init=my/points.ply", "my/points.ply"), ("init=hull", "hull")] {
         assert_eq!(Recipe::of(&[set]).unwrap().get("init.source").unwrap().as_str(), Some(back));
     }
