@@ -54,7 +54,7 @@ impl People {
         Self { tracks: cameras.iter().map(linked).collect() }
     }
 
-    /// Cameras that show nobody.
+    /// Cameras without people.
     pub(crate) fn missing(&self) -> impl Iterator<Item = usize> {
         (0..self.tracks.len()).filter(|&c| self.tracks[c].is_empty())
     }
@@ -96,7 +96,7 @@ impl People {
         all
     }
 
-    /// A further person: tracks that belong to nobody yet and whose keypoints meet, in as many cameras as do.
+    /// A further person: tracks without a person yet whose keypoints meet, in as many cameras as do.
     fn next(&self, cameras: &[Camera], rig: &Solution, known: &[Identity]) -> Option<Identity> {
         let free = |c: usize| -> Vec<usize> {
             (0..self.tracks[c].len()).filter(|&k| known.iter().all(|id| id[c] != Some(k))).collect()

@@ -82,7 +82,7 @@ pub(super) fn detected(
     let people = People::new(&frames);
     if let Some(c) = people.missing().next() {
         return Err(place(
-            Error::input(format!("the keypoints contain nobody in the images of camera {}", names[c]))
+            Error::input(format!("the keypoints contain no person in the images of camera {}", names[c]))
                 .remedy("Leave the camera out (use = false in import.toml), or align it by hand (--assist)."),
         ));
     }

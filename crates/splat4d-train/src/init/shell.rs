@@ -28,7 +28,7 @@ const SHARE: f64 = 0.25;
 const WIDTH: f64 = 0.6;
 /// Initial opacity: nothing is behind it, and what is faint lets Gaussians in front of it become its substitute.
 const OPACITY_START: f64 = 0.9;
-/// Cells beside the visible surroundings that it covers as well: behind the outlines of what is near.
+/// Cells around the visible surroundings that it covers as well: behind the outlines of what is near.
 const BEHIND: f64 = 2.0;
 
 choices! {

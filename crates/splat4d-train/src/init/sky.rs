@@ -39,7 +39,7 @@ const AGREES: f64 = 0.06;
 /// largest. A walk outdoors has 0.75, a synthetic sky less, a room 1.5 (`studies/records/2026-11-28-far-shell.md`).
 const BETTER: f64 = 0.85;
 const LARGEST_ERROR: f64 = 0.12;
-/// A cell with near points shows the surroundings all the same, and the points are wrong matches, if so many images at
+/// A cell with near points shows the surroundings all the same, and the points are wrong matches, if this many images at
 /// least agree there, and their median difference is at most this share of that at the best near radius.
 const WITNESSES: usize = 3;
 const MUCH_BETTER: f64 = 0.5;

@@ -119,6 +119,10 @@ impl Method for FilteredMethod {
         self.inner.first(plan)
     }
 
+    fn allows_layers(&self) -> bool {
+        self.inner.allows_layers()
+    }
+
     fn has_features(&self) -> bool {
         self.inner.has_features()
     }

@@ -384,6 +384,10 @@ pub trait Method: Send + Sync {
     fn suits(&self, _seen: &CaptureStats) -> Option<String> {
         None
     }
+    /// Whether a scene may have static layers next to the one that it trains.
+    fn allows_layers(&self) -> bool {
+        true
+    }
     /// Whether its Gaussians can have features for a pixel head.
     fn has_features(&self) -> bool {
         false

@@ -80,6 +80,11 @@ pub(crate) struct TrackedMethod {
 }
 
 impl Method for TrackedMethod {
+    /// Frames are fitted one after the other, with poses of the rows of one layer.
+    fn allows_layers(&self) -> bool {
+        false
+    }
+
     fn spec(&self, plan: &TrainContext) -> Spec {
         let first = plan.moments.first().map_or(plan.clip[0], |m| m.0);
         Spec::Tracked(TrackedSpec { times: vec![first], foreground: segments(plan, &self.tracked) })

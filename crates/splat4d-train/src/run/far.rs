@@ -20,7 +20,7 @@ pub(super) fn decided(opened: &OpenCapture, recipe: Recipe, listen: &mut dyn FnM
     if asked == FarShell::Off {
         return Ok(recipe);
     }
-    if let Some(why) = impossible(opened, &recipe) {
+    if let Some(why) = impossible(opened, &recipe)? {
         if asked == FarShell::On {
             listen(&Event::Warning { message: format!("there is no far shell (init.shell): {why}") });
             return Ok(recipe.with(|r| r.init.shell = FarShell::Off));
@@ -62,17 +62,17 @@ pub(super) fn decided(opened: &OpenCapture, recipe: Recipe, listen: &mut dyn FnM
 }
 
 /// Why this run cannot have one.
-fn impossible(opened: &OpenCapture, recipe: &Recipe) -> Option<&'static str> {
+fn impossible(opened: &OpenCapture, recipe: &Recipe) -> Result<Option<&'static str>> {
     let reasons = [
         (opened.capture.background.is_some(), "images are cut out of their background"),
-        (recipe.run.motion == "tracked", "the motion model `tracked` trains one layer"),
+        (!recipe.program()?.allows_layers(), "the motion model trains one layer"),
         (
             recipe.densify.strategy == Strategy::Mcmc,
             "densify.strategy = mcmc moves and shrinks Gaussians by the extent",
         ),
         (recipe.spacetime.has_features(), "a network makes the colours"),
     ];
-    reasons.into_iter().find(|(is, _)| *is).map(|(_, why)| why)
+    Ok(reasons.into_iter().find(|(is, _)| *is).map(|(_, why)| why))
 }
 
 #[cfg(test)]

@@ -111,7 +111,7 @@ pub(super) fn occupied(camera: &Camera, grid: [usize; 2], near: &[[f64; 3]]) -> 
     out
 }
 
-/// One image of every fixed camera, and of every position of moving ones; at most so many, evenly chosen.
+/// One image of every fixed camera, and of every position of moving ones; at most `most`, evenly chosen.
 pub(in crate::init) fn views(frames: &dyn Frames, most: usize) -> Vec<usize> {
     let mut places = HashSet::new();
     let new = |&i: &usize| {

@@ -39,10 +39,10 @@ fn a_requested_shell_gets_a_distance() {
 #[test]
 fn runs_that_cannot_have_a_shell_report_why() {
     for (word, why) in [("motion=tracked", "one layer"), ("densify.strategy=mcmc", "mcmc")] {
-        let (decided, heard, warned) = decided_of(&[word, "init.shell=on", "init.shell_distance=20"]);
+        let (decided, heard, warned) = decided_of(&["motion=still", word, "init.shell=on", "init.shell_distance=20"]);
         assert_eq!((decided.init.shell, decided.init.shell_at()), (FarShell::Off, None), "{word}");
         assert!(heard.is_empty() && warned.len() == 1 && warned[0].contains(why), "{word}: {warned:?}");
-        let (_, heard, warned) = decided_of(&[word]);
+        let (_, heard, warned) = decided_of(&["motion=still", word]);
         assert!(heard.is_empty() && warned.is_empty(), "{word}: nothing was requested");
     }
 }
