@@ -5,7 +5,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_cli::console::Console;
 use splat4d_cli::interrupt;
 use splat4d_train::recipe::{MotionName, Recipe};
-use splat4d_train::run::{follow::END_MARKER, open_capture};
+use splat4d_train::run::open_capture;
 use splat4d_workflow::evaluating::{Measure, evaluate};
 use splat4d_workflow::files;
 use splat4d_workflow::run_folder::Run;
@@ -17,6 +17,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+/// The file that ends a capture (docs/follow.md).
+const END_MARKER: &str = "capture.end";
 /// Time between two looks whether the study was stopped.
 const GLANCE: Duration = Duration::from_millis(50);
 

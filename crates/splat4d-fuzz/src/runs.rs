@@ -3,6 +3,7 @@
 
 use crate::Reader;
 use serde_json::json;
+use splat4d::format::safetensors::{self, Tensor};
 use splat4d_train::output::{self, Owner};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
@@ -10,6 +11,7 @@ use splat4d_train::run::corrected;
 use splat4d_train::run::follow::{self, Following};
 use splat4d_workflow::run_folder::{Run, RunRequest};
 use std::cell::OnceCell;
+use std::collections::BTreeMap;
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -21,7 +23,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
     Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
     Reader { name: "follow_plan", seeds: || vec![FOLLOW.into()], read: |b| open("frames/follow.json", b) },
-    Reader { name: "follow_frame", seeds: || vec![follow::example_frame()], read: |b| drop(follow::check_frame(b)) },
+    Reader { name: "follow_frame", seeds: || vec![frame()], read: |b| drop(follow::check_frame(b)) },
     Reader { name: "compress_json", seeds: || vec![COMPRESS.into()], read: |b| open("compress.json", b) },
     Reader { name: "geometry_json", seeds: || vec![GEOMETRY.into()], read: |b| open("geometry.json", b) },
     Reader { name: "refined_json", seeds: || vec![REFINED.into()], read: |b| open("refined.json", b) },
@@ -46,6 +48,24 @@ const REFINED: &str =
     r#"{"cameras": [{"camera": "a", "frame": null, "twist": [0, 0, 0, 0, 0, 0.1], "offset": 0.01, "focal": 0.02}]}"#;
 const GEOMETRY: &str = r#"{"measured": 0.5, "error": 0.01, "worst": "a", "worst_error": 0.02, "cameras": [{"camera": "a", "frames": 4, "measured": 0.5, "error": null, "ratio": 1.0}]}"#;
 const OWNER: &str = r#"{"command": "train", "process": 7, "host": "h", "since": "2026-11-27T00:00:00Z", "machine": "m", "beat": "0000000001"}"#;
+
+/// The file of a frame of two Gaussians, one of them new.
+fn frame() -> Vec<u8> {
+    let (geometry, sh) = ([0.0f32; 22], [0.0f32; 6]);
+    let tensors = [
+        Tensor::u32("active", &[1], &[0]),
+        Tensor::u32("origin", &[2], &[0, u32::MAX]),
+        Tensor::f32("geometry", &[2, 11], &geometry),
+        Tensor::f32("sh", &[2, 3], &sh),
+        Tensor::f32("errors", &[1], &[0.5]),
+        Tensor::f32("exposure", &[0], &[]),
+    ];
+    let facts = json!({"version": 1, "frame": 0, "facts": null}).to_string();
+    let mut bytes = Vec::new();
+    safetensors::write(&tensors, &BTreeMap::from([("splat4d-follow".to_owned(), facts)]), &mut bytes)
+        .expect("memory takes it");
+    bytes
+}
 
 fn run_json() -> String {
     json!({"version": "0.1.0", "capture": "/nowhere", "capture_name": "a", "iteration": 10, "iterations": 10, "seconds": 1.5,
@@ -115,7 +135,7 @@ mod tests {
         assert_eq!((run.metrics.len(), run.views.len(), run.views().unwrap().len()), (1, 1, 1));
         assert_eq!((run.name().as_str(), output::written(at).len()), ("a", 4));
         assert_eq!(Following::request(at).unwrap().0, Path::new("/nowhere"));
-        follow::check_frame(&follow::example_frame()).unwrap();
+        follow::check_frame(&frame()).unwrap();
         assert!(RunRequest::unbegun(at).is_some());
         assert!(Chunked::open(at).err().unwrap().to_string().contains("recipe"), "its fingerprint is another");
     }

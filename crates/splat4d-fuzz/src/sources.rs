@@ -68,7 +68,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("paths/keys.rs", By(&["camera_path"])),
     ("playable.rs", By(&["playback"])),
     ("predicting/score.rs", By(&["true_tracks", "npy"])),
-    ("importing.rs", By(&["predicted_npz"])),
+    ("predicted.rs", By(&["predicted_npz"])),
     (
         "priors.rs",
         Not("the list and the notes that it wrote itself, in plain data; the reader of the list is `priors_json`"),

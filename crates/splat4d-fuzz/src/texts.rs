@@ -9,7 +9,7 @@ use splat4d_import::calibration;
 use splat4d_import::check_clicks;
 use splat4d_import::corrections::{self, Corrections};
 use splat4d_import::generated;
-use splat4d_import::predicted::Predicted;
+use splat4d_import::predicted;
 use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
 use splat4d_workflow::texts::{self, Page};
@@ -34,7 +34,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "keypoints", seeds: || seeds(&[KEYPOINTS, COCO]), read: keypoints },
     Reader { name: "model_toml", seeds: models, read: |b| drop(texts::model(&text(b))) },
     Reader { name: "rig_cameras", seeds: || seeds(&[RIG]), read: |b| drop(generated::check_cameras(b)) },
-    Reader { name: "predicted_npz", seeds: predictions, read: |b| drop(Predicted::read(b).map(|p| p.len())) },
+    Reader { name: "predicted_npz", seeds: predictions, read: |b| drop(predicted::check_archive(b)) },
     Reader { name: "edit_request", seeds: requests, read: edit_request },
     Reader { name: "video_avi", seeds: films, read: film },
 ];

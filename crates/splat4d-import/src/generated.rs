@@ -24,10 +24,10 @@ const VIDEOS: &str = "videos/dense";
 /// What is written.
 const CAPTURE: &str = "capture.json";
 /// Key of `extra` in the capture: poses come from a network, and training refines them.
-pub const PREDICTED_POSES: &str = "predicted_poses";
+pub(crate) const PREDICTED_POSES: &str = "predicted_poses";
 
 /// Whether a folder is the output of 4DAnyone whose frames are not extracted yet.
-pub fn is_rig(root: &Path) -> bool {
+fn is_rig(root: &Path) -> bool {
     root.join(CAMERAS).is_file() && root.join(VIDEOS).is_dir() && !root.join(CAPTURE).is_file()
 }
 

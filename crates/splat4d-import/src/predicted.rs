@@ -40,17 +40,29 @@ struct Shot {
 }
 
 /// Poses, depth and images that a network gave.
-pub struct Predicted {
+struct Predicted {
     /// The network.
-    pub network: &'static str,
+    network: &'static str,
     /// Pixels across and down.
-    pub size: [usize; 2],
+    size: [usize; 2],
     shots: Vec<Shot>,
 }
 
-/// Whether a file may be one of these.
-pub fn is_archive(path: &Path) -> bool {
-    path.is_file() && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"))
+/// Makes a capture of an archive in a folder. Returns the result in words.
+///
+/// Errors: arrays that are missing, of other shapes or not finite; poses that are not rigid; no space.
+pub fn unpack(file: &Path, folder: &Path) -> Result<String> {
+    let bytes = splat4d_train::files::read(file)?;
+    let predicted = Predicted::read(&bytes).map_err(|e| e.at(file.display()))?;
+    predicted.write(folder)?;
+    let ([width, height], count) = (predicted.size, predicted.shots.len());
+    Ok(format!("{count} images of {width}x{height} with the poses of {}, which training refines", predicted.network))
+}
+
+/// Checks the bytes of an archive. Errors: as [`unpack`].
+#[doc(hidden)]
+pub fn check_archive(bytes: &[u8]) -> Result<()> {
+    Predicted::read(bytes).map(drop)
 }
 
 /// An array without a leading axis of length 1, of `rank` axes.
@@ -69,7 +81,7 @@ const SAVE: &str = "Save the network's prediction unchanged (numpy.savez): docs/
 
 impl Predicted {
     /// Reads an archive. Errors: arrays that are missing, of other shapes or not finite; poses that are not rigid.
-    pub fn read(bytes: &[u8]) -> Result<Self> {
+    fn read(bytes: &[u8]) -> Result<Self> {
         let names: Vec<String> =
             Archive::open(bytes)?.names().iter().map(|n| n.trim_end_matches(".npy").to_owned()).collect();
         let has = |name: &str| names.iter().any(|n| n == name);
@@ -137,18 +149,8 @@ impl Predicted {
         Ok(Self { network, size: [width, height], shots })
     }
 
-    /// Number of images.
-    pub fn len(&self) -> usize {
-        self.shots.len()
-    }
-
-    /// Whether there is none.
-    pub fn is_empty(&self) -> bool {
-        self.shots.is_empty()
-    }
-
     /// Writes images, depth maps and, last, `capture.json` into a folder. Errors: no space.
-    pub fn write(&self, folder: &Path) -> Result<()> {
+    fn write(&self, folder: &Path) -> Result<()> {
         let [width, height] = self.size;
         let mut cameras = Vec::new();
         for (i, shot) in self.shots.iter().enumerate() {
@@ -224,7 +226,7 @@ mod tests {
             [(true, false, "VGGT"), (true, true, "VGGT"), (false, false, "Depth Anything 3")]
         {
             let predicted = Predicted::read(&archive(planar, batch, |_, _, _| {})).unwrap();
-            assert_eq!((predicted.network, predicted.len(), predicted.size), (network, 2, [4, 2]));
+            assert_eq!((predicted.network, predicted.shots.len(), predicted.size), (network, 2, [4, 2]));
             let folder = tempfile::tempdir().unwrap();
             predicted.write(folder.path()).unwrap();
             let capture = Arc::new(Capture::open(folder.path(), &CaptureOptions::default()).unwrap());

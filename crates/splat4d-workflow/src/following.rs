@@ -21,7 +21,8 @@ use splat4d_train::event::{Event, FollowedFrame};
 use splat4d_train::output::OutputFolder;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::follow::{Arrival, Following};
+use splat4d_train::run::follow::{Arrival, Following, Segment};
+use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -69,10 +70,11 @@ pub fn follow(
         }
     };
     let (folder, _) = asked.begin(&run, options.force, options.command)?;
-    let begun = Following::is(&run);
+    let kept = Cell::new(Following::is(&run));
     let device = chosen(options.device, "training", listener);
     let followed = Following::begin(capture, recipe, &run, device).and_then(|following| {
-        Live { following, run: &run, folder: &folder, options, stop, listener, film: None, rows: Vec::new() }.work()
+        let (run, folder, kept, film, rows) = (&run, &folder, &kept, None, Vec::new());
+        Live { following, capture, recipe, run, folder, options, stop, listener, film, rows, kept }.work()
     });
     match followed {
         Ok(interrupted) => {
@@ -84,7 +86,7 @@ pub fn follow(
         }
         Err(error) => {
             // Without a frame there is nothing to continue.
-            if !begun && Following::frames(&run) == 0 {
+            if !kept.get() {
                 folder.abandon();
             }
             Err(error)
@@ -120,6 +122,8 @@ fn check(options: &TrainingOptions) -> Result<()> {
 /// A capture that is followed.
 struct Live<'a> {
     following: Following,
+    capture: &'a Path,
+    recipe: &'a Recipe,
     run: &'a Path,
     folder: &'a OutputFolder,
     options: &'a TrainingOptions,
@@ -128,6 +132,8 @@ struct Live<'a> {
     film: Option<Film>,
     /// Lines of the table, and the frames of those whose bytes are not known yet.
     rows: Vec<(FollowedFrame, Option<u64>)>,
+    /// Whether there is a frame, with which the run can be continued.
+    kept: &'a Cell<bool>,
 }
 
 /// What came after waiting for a frame.
@@ -142,8 +148,8 @@ impl Live<'_> {
     fn work(mut self) -> Result<bool> {
         let listener = self.listener;
         listener.stop_polled(SAVING);
-        if self.following.next() > self.following.first() {
-            let done = self.following.next() - self.following.first();
+        if self.following.next() > self.recipe.capture.first_frame {
+            let done = self.following.next() - self.recipe.capture.first_frame;
             listener.result(&format!("{done} frames are done: the run continues with frame {}", self.following.next()));
             self.start()?;
         }
@@ -157,6 +163,7 @@ impl Live<'_> {
             listener.clear();
             let Some(frame) = frame else { break true };
             self.folder.begun();
+            self.kept.set(true);
             if self.film.is_none() {
                 self.start()?;
             }
@@ -189,7 +196,7 @@ impl Live<'_> {
                 Arrival::Ended { left } => (left.clone().unwrap_or_default(), true, left.is_some()),
                 Arrival::Incomplete { what, begun } => (what, false, begun),
             };
-            let patience = self.following.recipe().follow.timeout;
+            let patience = self.recipe.follow.timeout;
             if !ended && began.elapsed().as_secs_f64() < patience {
                 listener.phase(&format!("waiting for frame {next}"), 0, 0);
                 std::thread::sleep(POLL);
@@ -201,10 +208,10 @@ impl Live<'_> {
                 (next..later).for_each(|_| self.following.skip());
                 continue;
             }
-            if next == self.following.first() {
+            if next == self.recipe.capture.first_frame {
                 let waited = if ended { String::new() } else { format!(" within {patience} s") };
                 return Err(Error::input(format!("no frame of the capture is complete{waited}: {what}"))
-                    .at(self.following.root().display())
+                    .at(self.capture.display())
                     .remedy("Start the recording, or raise option `follow_timeout`."));
             }
             if begun {
@@ -242,11 +249,9 @@ impl Live<'_> {
         self.listener.on_event(&on_event);
         let run = Run::open(self.run)?;
         let views = run.views()?;
-        let shell = self.following.shell(self.following.next()).expect("a frame is done");
-        let first = self.following.first();
-        let nodes = self.following.nodes(first..first + 1);
-        let (bounds, clip) = (bounds(&nodes), [self.following.seconds(first); 2]);
-        let outline = Outline { clip, sh_degree: self.following.sh_degree(), bounds };
+        let first = self.recipe.capture.first_frame;
+        let Segment { shell, sh_degree, nodes } = self.following.segment(first..first + 1);
+        let outline = Outline { clip: shell.clip, sh_degree, bounds: bounds(&nodes) };
         let stage = Source::own(shell.clone()).stage(&views);
         let about = Meta { title: name, ..meta(&shell, &outline, &stage, &distinct(&views)) };
         let film = Film::open(&self.run.join(FILE), about, self.following.next())?;
@@ -270,24 +275,22 @@ impl Live<'_> {
 
     /// Appends the frames that are not in the playback file yet: as many as make a part, or all.
     fn grow(&mut self, all: bool) -> Result<()> {
-        let (first, done) = (self.following.first(), self.following.next());
+        let (first, done) = (self.recipe.capture.first_frame, self.following.next());
         let film = self.film.as_mut().expect("it is opened with the first frame");
         let mut grown = false;
         loop {
             let from = film.frames(first);
             // The first frame alone, so that there is something to play.
-            let length = if from == first { 1 } else { self.following.recipe().follow.segment };
+            let length = if from == first { 1 } else { self.recipe.follow.segment };
             // How Gaussians leave a frame is known with the next one.
             let known = if all || from == first { done } else { done - 1 };
             if from >= known || !all && known - from < length {
                 break;
             }
             let to = known.min(from + length);
-            let nodes = self.following.nodes(from..to);
-            let clip = [self.following.seconds(first), self.following.seconds(to - 1)];
-            let sh_degree = self.following.sh_degree();
-            let bytes = part(&film.about, nodes.clone(), clip, sh_degree)?;
-            let bounds = union(film.about.bounds, bounds(&nodes));
+            let Segment { shell, sh_degree, nodes } = self.following.segment(from..to);
+            let (clip, bounds) = (shell.clip, union(film.about.bounds, bounds(&nodes)));
+            let bytes = part(&film.about, nodes, clip, sh_degree)?;
             film.append(&bytes, from..to, Meta { clip, sh_degree, bounds, ..film.about.clone() })?;
             let each = (bytes.len() as u64).div_ceil((to - from) as u64);
             self.rows
@@ -322,7 +325,7 @@ impl Live<'_> {
         let film = self.film.as_ref().expect("it was appended to");
         let bytes = film.finished((None, None))?;
         let held_out = self.rows.last().and_then(|(frame, _)| frame.psnr);
-        let iteration = self.following.next() - self.following.first();
+        let iteration = self.following.next() - self.recipe.capture.first_frame;
         self.listener.event(&Event::Snapshot { iteration, bytes: bytes.into(), held_out });
         Ok(())
     }

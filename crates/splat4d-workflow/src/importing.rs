@@ -1,14 +1,13 @@
 //! The work behind `import`: videos become a capture, which is checked.
 
 use crate::events::Listener;
-use crate::files;
 use crate::report::doctor;
 use serde_json::{Value, json};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_import::calibration;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
-use splat4d_import::predicted::Predicted;
+use splat4d_import::predicted;
 use splat4d_import::recording::{self, CameraReport, Report, Request};
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
@@ -82,16 +81,9 @@ pub fn import_predicted(file: &Path, folder: &Path, console: &dyn Listener) -> R
     check_apart(folder, &[Input::new(file, "what is imported,")])?;
     let _owned = OutputFolder::amend(folder, "import")?;
     console.phase("reading the prediction", 0, 0);
-    let predicted = Predicted::read(&files::read(file)?).map_err(|e| e.at(file.display()))?;
-    predicted.write(folder)?;
+    let words = predicted::unpack(file, folder)?;
     console.clear();
-    let [width, height] = predicted.size;
-    Ok(format!(
-        "{}: {} images of {width}x{height} with the poses of {}, which training refines",
-        folder.display(),
-        predicted.len(),
-        predicted.network
-    ))
+    Ok(format!("{}: {words}", folder.display()))
 }
 
 /// An error of an import.

@@ -441,9 +441,6 @@ fn extract(_: &Path, _: &AtomicBool, _: &dyn Listener) -> Result<()> {
 #[cfg(feature = "import")]
 fn extract(source: &Path, stop: &AtomicBool, listener: &dyn Listener) -> Result<()> {
     let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
-    if shipped::videos(root).is_empty() && !generated::is_rig(root) {
-        return Ok(());
-    }
     let mut listen = |event: &Event| listener.event(event);
     let (progress, stopped) = (&mut Progress(&mut listen), || stop.load(Ordering::SeqCst));
     let found = match generated::extract(root, progress, &stopped)? {

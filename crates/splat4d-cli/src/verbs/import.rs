@@ -6,7 +6,6 @@ use crate::serving::{self, Place};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
-use splat4d_import::predicted;
 use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
@@ -183,7 +182,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return Err(left_out("--assist", "serve").into());
     }
     if let [file] = &args.videos[..]
-        && predicted::is_archive(file)
+        && file.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"))
     {
         let words = import_predicted(file, &args.output, console)?;
         console.print_line(&words);

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 /// The file in a capture's folder that states that no further frame will come.
-pub const END_MARKER: &str = "capture.end";
+pub(super) const END_MARKER: &str = "capture.end";
 /// A file that was last written so long ago is taken as complete without a second look.
 const SETTLED: Duration = Duration::from_secs(1);
 /// Endings of files that are decoded as images; of others only the length is watched.

@@ -1,8 +1,8 @@
 //! One frame of a followed capture: the Gaussians whose pixels changed learn, and new ones appear among them.
 
 use super::changed::{Comparison, TileErrors, settled};
-use super::history::{History, NEW, gathered, still};
-use super::record::Record;
+use super::history::{History, gathered, still};
+use super::record::{NEW, Record};
 use crate::event::{Event, Progress};
 use crate::methods::{TrainContext, still as still_method};
 use crate::recipe::Recipe;

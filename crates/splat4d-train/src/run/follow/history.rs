@@ -1,7 +1,7 @@
 //! The Gaussians of a followed capture over time. At every frame a Gaussian either keeps its numbers, which costs
 //! nothing, or is replaced. What was replaced is kept as pieces until it is in the playback file.
 
-use super::record::Record;
+use super::record::{NEW, ROW, Record};
 use splat4d::format::playback::{Node, Primitive};
 use splat4d::layers::Layer;
 use splat4d::math::{Real, quat, sh};
@@ -11,12 +11,8 @@ use splat4d::scene::{GEOMETRY, LifeKind, Params, SH};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Numbers of a row of [`GEOMETRY`].
-pub(super) const ROW: usize = 11;
 /// Mean and quaternion, the first of them.
 const POSE: usize = 7;
-/// A record's origin of a Gaussian that has no predecessor.
-pub(super) const NEW: u32 = u32::MAX;
 
 /// Mean and quaternion of a Gaussian.
 pub(super) type Pose = [f32; POSE];

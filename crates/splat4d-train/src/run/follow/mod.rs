@@ -17,7 +17,7 @@ mod record;
 #[cfg(test)]
 mod tests;
 
-pub use arrival::{Arrival, END_MARKER};
+pub use arrival::Arrival;
 
 use super::checkpoint::write_atomically;
 use super::identity::{fingerprint, recipe_print};
@@ -66,6 +66,17 @@ pub struct Following {
     /// The next frame.
     next: usize,
     state: Option<State>,
+}
+
+/// Some frames of a followed capture.
+#[derive(Clone, Debug)]
+pub struct Segment {
+    /// A scene without Gaussians: background, axes, rate, and the clip from the first frame to the segment's last one.
+    pub shell: Scene<f32>,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: usize,
+    /// Gaussians by the span in which they are rendered.
+    pub nodes: Vec<Node>,
 }
 
 /// The present scene.
@@ -124,11 +135,6 @@ impl Following {
         run.join(FOLDER).join(PLAN).is_file()
     }
 
-    /// Number of frames that a run has finished.
-    pub fn frames(run: &Path) -> usize {
-        record::list(&run.join(FOLDER)).len()
-    }
-
     /// The capture and the recipe of a run, to [`begin`](Self::begin) it again. Errors: it is none, or damaged.
     pub fn request(run: &Path) -> Result<(PathBuf, Recipe)> {
         let plan = read_plan(&run.join(FOLDER).join(PLAN))?;
@@ -146,27 +152,17 @@ impl Following {
         self.run.join(FOLDER)
     }
 
-    /// The capture's folder.
-    pub fn root(&self) -> &Path {
-        &self.root
-    }
-
     /// The next frame's number.
     pub fn next(&self) -> usize {
         self.next
     }
 
     /// The first frame's number.
-    pub fn first(&self) -> usize {
+    fn first(&self) -> usize {
         self.recipe.capture.first_frame
     }
 
-    /// The settings.
-    pub fn recipe(&self) -> &Recipe {
-        &self.recipe
-    }
-
-    /// Looks whether a frame has arrived: the next one, or a later one. Errors: an image of another size.
+    /// Checks whether a frame has arrived: the next one, or a later one. Errors: an image of another size.
     pub fn look(&mut self, frame: usize) -> Result<Arrival> {
         let most = self.recipe.capture.max_frames;
         if most > 0 && frame >= self.first().saturating_add(most) {
@@ -353,26 +349,23 @@ impl Following {
     }
 
     /// The seconds of a frame on the scene clock.
-    pub fn seconds(&self, frame: usize) -> f64 {
+    fn seconds(&self, frame: usize) -> f64 {
         let fps = self.state.as_ref().map_or(splat4d::scene::time::DEFAULT_FPS, |s| s.shell.fps);
         frame as f64 / fps
     }
 
-    /// A scene without Gaussians: background, axes, rate, and the clip up to frame `end`, exclusive. `None`: no frame is
-    /// done.
-    pub fn shell(&self, end: usize) -> Option<Scene<f32>> {
-        let clip = [self.seconds(self.first()), self.seconds(end.saturating_sub(1))];
-        self.state.as_ref().map(|s| Scene { clip, ..s.shell.clone() })
+    /// Some frames, as a part of a playback file. Frames that were [forgotten](Self::forget) are incomplete.
+    ///
+    /// Panics: no frame is done.
+    pub fn segment(&self, frames: Range<usize>) -> Segment {
+        let state = self.state.as_ref().expect("a frame is done");
+        let clip = [self.seconds(self.first()), self.seconds(frames.end.saturating_sub(1))];
+        let sh_degree = splat4d::math::sh::degree_of(state.history.coefficients()).unwrap_or(0);
+        Segment { shell: Scene { clip, ..state.shell.clone() }, sh_degree, nodes: self.nodes(frames) }
     }
 
-    /// Degree of the spherical harmonics.
-    pub fn sh_degree(&self) -> usize {
-        let coefficients = self.state.as_ref().map_or(1, |s| s.history.coefficients());
-        splat4d::math::sh::degree_of(coefficients).unwrap_or(0)
-    }
-
-    /// Some frames as parts of a playback file. Frames that were [forgotten](Self::forget) are incomplete.
-    pub fn nodes(&self, frames: Range<usize>) -> Vec<Node> {
+    /// Some frames as nodes.
+    fn nodes(&self, frames: Range<usize>) -> Vec<Node> {
         self.state.as_ref().map_or_else(Vec::new, |s| s.history.nodes(frames, &|f| self.seconds(f)))
     }
 
@@ -393,12 +386,4 @@ impl Following {
 #[doc(hidden)]
 pub fn check_frame(bytes: &[u8]) -> Result<()> {
     Record::parse(bytes, 0).map(drop)
-}
-
-/// The file of a small frame.
-#[doc(hidden)]
-pub fn example_frame() -> Vec<u8> {
-    let params = splat4d::scene::Params::new(2, 1, &[]);
-    let record = Record { frame: 0, active: vec![0], params, origin: vec![0, history::NEW], ..Record::default() };
-    record.bytes().expect("memory takes it")
 }

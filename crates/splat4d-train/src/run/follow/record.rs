@@ -1,7 +1,6 @@
 //! The file of a followed frame: what it changed. All files of a run in order give its state again, bit for bit, so
 //! that a run continues after any interruption.
 
-use super::history::{NEW, ROW};
 use crate::output::write_atomically;
 use crate::{Error, Result};
 use serde_json::{Value, json};
@@ -10,6 +9,10 @@ use splat4d::scene::{GEOMETRY, Params, SH};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// Numbers of a row of [`GEOMETRY`].
+pub(super) const ROW: usize = 11;
+/// A record's origin of a Gaussian that has no predecessor.
+pub(super) const NEW: u32 = u32::MAX;
 /// The metadata's key.
 const KEY: &str = "splat4d-follow";
 /// Version of the files.

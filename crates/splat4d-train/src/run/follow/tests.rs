@@ -1,6 +1,8 @@
 //! A tiny capture that arrives frame by frame.
 
-use super::history::{NEW, still};
+use super::arrival::END_MARKER;
+use super::history::still;
+use super::record::NEW;
 use super::*;
 use crate::run::tests::{Place, recipe};
 use splat4d::format::playback::Primitive;
