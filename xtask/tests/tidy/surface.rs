@@ -4,9 +4,10 @@ use super::{code, files, is_test, is_word, read, report};
 
 /// Public items of a crate at most: lines of its sources, tests aside, that begin a `pub` function, method, type, trait
 /// or constant. `unreachable_pub` ensures that such a line can be reached. A lower count lowers the limit; the goals
-/// are 600 for `splat4d` and 250 for `splat4d-train`.
+/// are 600 for `splat4d` and 250 for `splat4d-train`. Raised once, when captures that are still filmed and networks' poses
+/// came: the command and Python call them.
 const PUBLIC: [(&str, usize); 3] =
-    [("crates/splat4d/src", 863), ("crates/splat4d-train/src", 469), ("crates/splat4d-import/src", 94)];
+    [("crates/splat4d/src", 863), ("crates/splat4d-train/src", 487), ("crates/splat4d-import/src", 98)];
 /// A count this far below its limit is a limit to be lowered.
 const SLACK: usize = 10;
 
