@@ -2,7 +2,7 @@ use super::*;
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
 use crate::init::sky::tests::{FAR, Film};
-use crate::init::{self, InitSettings, Seeds, Source};
+use crate::init::{self, FarShell, InitSettings, Seeds, Source};
 use crate::maintenance::Limits;
 use crate::methods::stages;
 use crate::recipe::{MotionName, Recipe};
@@ -156,6 +156,6 @@ fn nothing_grows_before_the_sky_in_training() {
 #[test]
 fn a_shell_needs_a_decision_and_a_distance() {
     let of = |shell, distance| InitSettings { shell, shell_distance: distance, ..InitSettings::default() }.shell_at();
-    assert_eq!(of(init::FarShell::On, 30.0), Some(30.0));
-    assert_eq!([of(init::FarShell::Auto, 30.0), of(init::FarShell::Off, 30.0), of(init::FarShell::On, 0.0)], [None; 3]);
+    assert_eq!(of(FarShell::On, 30.0), Some(30.0));
+    assert_eq!([of(FarShell::Auto, 30.0), of(FarShell::Off, 30.0), of(FarShell::On, 0.0)], [None; 3]);
 }

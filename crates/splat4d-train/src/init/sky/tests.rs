@@ -3,7 +3,7 @@
 use super::*;
 use splat4d::math::Se3;
 use splat4d::math::se3::normalize;
-use splat4d::scene::Time;
+use splat4d::scene::{Planes, Time};
 
 const SIZE: [usize; 2] = [160, 120];
 const FOCAL: f64 = 140.0;
