@@ -187,6 +187,9 @@ mod tests {
     use std::sync::Arc;
 
     /// Two images of 4x2 pixels; image i is red (i + 1)/4, and 2 + i away.
+    /// Of an array by its name: shape and values.
+    type Change<'a> = &'a dyn Fn(&str, &mut Vec<usize>, &mut Vec<f32>);
+
     fn archive(planar: bool, batch: bool, change: impl Fn(&str, &mut Vec<usize>, &mut Vec<f32>)) -> Vec<u8> {
         let (n, h, w) = (2, 2, 4);
         let red = |i: usize| (i + 1) as f32 / 4.0;
@@ -241,7 +244,7 @@ mod tests {
 
     #[test]
     fn arrays_that_do_not_fit_are_named() {
-        let error = |change: &dyn Fn(&str, &mut Vec<usize>, &mut Vec<f32>)| {
+        let error = |change: Change<'_>| {
             Predicted::read(&archive(true, false, change)).err().map_or_else(String::new, |e| e.to_string())
         };
         let of_poses = |name: &str| POSES.contains(&name);
