@@ -16,18 +16,18 @@ const PAGES: [Page; 4] = [
         file: "cli.md",
         head: "# Command line: captures and training\n\nEvery option, as `splat4d COMMAND --help` prints it. Tasks and \
                examples of all commands: [commands](verbs.md).\n\n| page | commands |\n|---|---|\n\
-               | this page | import, info, train, join, status |\n\
-               | [results](cli-results.md) | eval, compare, render, predict, localise |\n\
+               | this page | import, info, train, join |\n\
+               | [results](cli-results.md) | status, eval, compare, render, predict, localise |\n\
                | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
                | [conversion and edits](cli-edits.md) | convert, edit, label, priors, recipe, completions |\n\n\
                Every command also accepts these options:\n",
-        commands: &["import", "info", "train", "join", "status"],
+        commands: &["import", "info", "train", "join"],
     },
     Page {
         file: "cli-results.md",
-        head: "# Command line: results\n\nOptions of `eval`, `compare`, `render`, `predict` and `localise`. Options that every \
-               command accepts: [captures and training](cli.md).\n",
-        commands: &["eval", "compare", "render", "predict", "localise"],
+        head: "# Command line: results\n\nOptions of `status`, `eval`, `compare`, `render`, `predict` and `localise`. Options that \
+               every command accepts: [captures and training](cli.md).\n",
+        commands: &["status", "eval", "compare", "render", "predict", "localise"],
     },
     Page {
         file: "cli-scenes.md",
