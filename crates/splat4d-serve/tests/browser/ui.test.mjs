@@ -32,7 +32,9 @@ async function open(path = '', { size = [1000, 700], config, wrong = false, read
   page.on('pageerror', e => errors.push(e.stack));
   page.on('console', m => m.type() === 'error' && errors.push(m.text()));
   await page.goto(site.url + path);
-  if (ready) await page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  const waiting = ready && page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  // What the page said explains why it is not ready.
+  if (ready) await waiting.catch(e => { throw new Error([e.message, ...errors].join('\n')); });
   return {
     page, context,
     /** f(element, argument) in the page. */
@@ -59,6 +61,16 @@ test('the page preloads every module', () => {
   }
   const named = [...text('index.html').matchAll(/modulepreload" href="\.\/([\w.-]+)"/g)].map(m => m[1]);
   assert.deepEqual(named.sort(), [...met].sort());
+});
+
+test('the stand-in for files has every method that the player calls', () => {
+  const text = name => readFileSync(new URL(`../../player/${name}`, import.meta.url), 'utf8');
+  const calls = ['player.js', 'element.js'].flatMap(name => [...text(name).matchAll(/\bfile\??\.(\w+)\(/g)].map(m => m[1]));
+  const methods = [...text('scene-file.js').matchAll(/^  (?:static |async )*(\w+)\(.*\) \{$/gm)].map(m => m[1]);
+  const used = methods.filter(name => calls.includes(name));
+  assert.ok(used.includes('watch'), `${used}`);
+  const standIn = readFileSync(new URL('mock/scene-file.js', import.meta.url), 'utf8');
+  assert.deepEqual(used.filter(name => !new RegExp(`^  (?:static |async )*${name}\\(`, 'm').test(standIn)), []);
 });
 
 test('the resolution falls as far as needed and useful, and rises again', () => {

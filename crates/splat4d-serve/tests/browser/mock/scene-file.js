@@ -1,6 +1,5 @@
 // Replaces the reader of playback files in the interface's tests: a synthetic scene of six pages, which arrive
-// late
-// on purpose. The address states what to do: `broken` fails, `slow` takes its time, `still` has one time only.
+// late on purpose. The address states what to do: `broken` fails, `slow` takes its time, `still` has one time only.
 
 import { SceneError } from './errors.js';
 
@@ -47,6 +46,7 @@ export class SceneFile {
     return { id, count: COUNT };
   }
 
+  watch() {}
   async poster() { return null; }
   async sound() { return globalThis.mockSound ?? null; }
   activePages(t) { return this.pages.filter(p => p.from <= t && t < p.to); }
