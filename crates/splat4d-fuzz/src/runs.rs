@@ -22,7 +22,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "per_view_json", seeds: || vec![PER_VIEW.into()], read: |b| open("per_view.json", b) },
     Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
     Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
-    Reader { name: "follow_plan", seeds: || vec![FOLLOW.into()], read: |b| open("frames/follow.json", b) },
+    Reader { name: "follow_plan", seeds: || vec![FOLLOW.into()], read: follow_plan },
     Reader { name: "follow_frame", seeds: || vec![frame()], read: |b| drop(follow::check_frame(b)) },
     Reader { name: "compress_json", seeds: || vec![COMPRESS.into()], read: |b| open("compress.json", b) },
     Reader { name: "geometry_json", seeds: || vec![GEOMETRY.into()], read: |b| open("geometry.json", b) },
@@ -84,16 +84,26 @@ thread_local! {
 
 /// Opens the run in which one file has other bytes, and puts that back.
 fn open(file: &str, bytes: &[u8]) {
-    FOLDER.with(|folder| {
-        let run = folder.get_or_init(made).path();
-        let path = run.join(file);
-        std::fs::write(&path, bytes).expect("the disk takes a file");
+    with_file(file, bytes, |run| {
         if let Ok(run) = Run::open(run) {
             drop((run.name(), run.iteration(), run.scene_file(), run.views()));
         }
         drop((corrected::read(run), Owner::holder(run)));
-        drop(Following::request(run));
         drop((Chunked::open(run).map(|c| c.parts()), RunRequest::unbegun(run), output::written(run)));
+    });
+}
+
+/// Nothing else reads that file.
+fn follow_plan(bytes: &[u8]) {
+    with_file("frames/follow.json", bytes, |run| drop(Following::request(run)));
+}
+
+fn with_file(file: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
+    FOLDER.with(|folder| {
+        let run = folder.get_or_init(made).path();
+        let path = run.join(file);
+        std::fs::write(&path, bytes).expect("the disk takes a file");
+        read(run);
         std::fs::remove_file(path).expect("it is there");
     });
 }
