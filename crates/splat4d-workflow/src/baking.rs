@@ -256,7 +256,7 @@ fn mse(psnr: f64) -> f64 {
 /// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of
 /// outputs.
 pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, listener: &dyn Listener) -> Result<Value> {
-    if !files::is_playback(out) && !out.starts_with("/dev") {
+    if !files::is_playback(out) && !files::is_stream(out) {
         return Err(Error::input("the name does not end in .s4d")
             .at(out.display())
             .remedy("Use option `output` NAME.s4d."));

@@ -289,7 +289,7 @@ pub fn warn_of_empty(scene: &Scene<f32>, time: f64, count: usize, listener: &dyn
 /// Writes the whole scene as one page with its player; with `link` the scene is a file of its own, for web servers.
 pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listener) -> Result<()> {
     if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
-        && !out.starts_with("/dev")
+        && !files::is_stream(out)
     {
         return Err(Error::input("a page's name ends in .html")
             .at(out.display())

@@ -128,9 +128,25 @@ pub fn is_playback(path: &Path) -> bool {
     path.extension().is_some_and(|e| [EXTENSION, OLD_EXTENSION].iter().any(|known| e.eq_ignore_ascii_case(known)))
 }
 
+/// Whether a path is a pipe or a device, such as `/dev/stdout` or `/dev/null`: its name has no rules, and nothing is lost
+/// when several outputs go there. Files in `/dev/shm` are files.
+pub fn is_stream(path: &Path) -> bool {
+    path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn devices_are_streams_and_files_are_not() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(!is_stream(folder.path()) && !is_stream(&folder.path().join("new.s4d")));
+        // Also in `/dev/shm`, where scratch files often are.
+        assert!(!is_stream(Path::new("/dev/shm/new.s4d")));
+        #[cfg(unix)]
+        assert!(is_stream(Path::new("/dev/null")));
+    }
 
     #[test]
     fn base64_as_in_rfc_4648() {

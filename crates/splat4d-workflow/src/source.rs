@@ -76,7 +76,7 @@ pub fn keep_all(path: &Path, run: Option<&Run>, outputs: &[&Path], others: &[&Pa
     };
     for (i, output) in outputs.iter().enumerate() {
         keep(path, run, output, others)?;
-        if !output.starts_with("/dev") && outputs[..i].iter().any(|before| place(before) == place(output)) {
+        if !files::is_stream(output) && outputs[..i].iter().any(|before| place(before) == place(output)) {
             return Err(Error::input("two outputs have the same name")
                 .at(output.display())
                 .remedy("Give each a name of its own."));

@@ -215,7 +215,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return Ok(());
     }
     let out = args.output.as_ref().expect("clap requires an output");
-    if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) && !out.starts_with("/dev") {
+    if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) && !files::is_stream(out) {
         return Err(Error::input("a time of the scene is written as .ply, and a page as .html")
             .at(out.display())
             .remedy("Use -o NAME.ply or -o NAME.html; `splat4d convert` writes other formats, `splat4d bake` a .s4d.")
