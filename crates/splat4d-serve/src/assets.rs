@@ -30,6 +30,7 @@ const FILES: &[(&str, &str)] = player![
     "edit-tools.js",
     "element.js",
     "errors.js",
+    "fovea.js",
     "gl.js",
     "glsl.js",
     "icons.js",
