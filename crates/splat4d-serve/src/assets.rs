@@ -38,6 +38,7 @@ const FILES: &[(&str, &str)] = player![
     "labels.js",
     "ladder.js",
     "live.js",
+    "measure.js",
     "order.js",
     "pace.js",
     "page.js",

@@ -255,3 +255,28 @@ test('a headset whose frames are late thins the edges, and reports it', options,
   assert.deepEqual([seen.first, seen.last], [0, 1]);
   assert.deepEqual(errors, []);
 });
+
+test('a page measures its device, then the headset', options, async (t) => {
+  const { page, errors } = await prepared(t);
+  const seen = await page.evaluate(async () => {
+    const element = document.querySelector('splat-4d'),
+      { player } = element,
+      { measure } = await import('/player/measure.js'),
+      { enter } = await import('/player/xr.js'),
+      rows = [];
+    await measure(element, (row) => rows.push(row), { before: 1, seconds: 3 });
+    const ended = enter(player);
+    for (let i = 0; i < 600 && rows.length < 2; i++) await new Promise((done) => setTimeout(done, 50));
+    await window.device.activeSession.end();
+    await ended;
+    return { rows, frames: player.frames };
+  });
+  t.diagnostic(JSON.stringify(seen));
+  const cells = seen.rows.map((row) => row.split('|').slice(1, -1).map((cell) => cell.trim()));
+  assert.equal(cells.length, 2);
+  for (const [, , rung, drawn, fps] of cells) assert.ok(rung === 'whole' && +drawn.replace(',', '') > 1000 && +fps > 0 && +fps < 1000);
+  assert.match(cells[0][0], /^320×\d+, .*SwiftShader/);
+  assert.match(cells[1][0], /^headset, /);
+  assert.ok(seen.frames > 0);
+  assert.deepEqual(errors, []);
+});
