@@ -24,9 +24,9 @@ export async function measure(element, shown = () => {}, { before = BEFORE, seco
   const { player } = element, wait = s => new Promise(done => setTimeout(done, 1000 * s));
   const run = async headset => {
     await wait(before);
-    const { frames } = player, from = performance.now();
+    const { frames } = player.figures, from = performance.now();
     await wait(seconds);
-    const made = row(element, headset, player.frames - frames, (performance.now() - from) / 1000);
+    const made = row(element, headset, player.figures.frames - frames, (performance.now() - from) / 1000);
     console.info(made);
     shown(made);
     return made;

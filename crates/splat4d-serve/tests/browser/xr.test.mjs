@@ -269,7 +269,7 @@ test('a page measures its device, then the headset', options, async (t) => {
     for (let i = 0; i < 600 && rows.length < 2; i++) await new Promise((done) => setTimeout(done, 50));
     await window.device.activeSession.end();
     await ended;
-    return { rows, frames: player.frames };
+    return { rows, frames: player.figures.frames };
   });
   t.diagnostic(JSON.stringify(seen));
   const cells = seen.rows.map((row) => row.split('|').slice(1, -1).map((cell) => cell.trim()));
