@@ -6,7 +6,7 @@ import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } f
 const from = new URL('../player/', import.meta.url),
   to = new URL('./player/', import.meta.url);
 /// Of the program's own page: an embedding page has its own.
-const OWN = ['index.html', 'page.js'];
+const OWN = ['index.html', 'measure.js', 'page.js'];
 
 function lean(text) {
   let inside = false;

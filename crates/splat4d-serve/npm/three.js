@@ -380,7 +380,7 @@ export class Splat4D extends THREE.Mesh {
     this.#schedule.want({ time, at, epoch: this.#epochs, view: { cameraFromWorld: this.#scratch.rows } }, now);
   }
 
-  #ordered({ order, count, generation }) {
+  #ordered({ orders: [{ order, count }], generation }) {
     if (this.#gone) return;
     const now = performance.now(),
       accepted = this.#schedule.arrived(now);

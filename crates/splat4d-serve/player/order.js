@@ -17,11 +17,12 @@ export class Order {
   #sorter = null;
   /// [message, what moves with it], until the worker states that it runs: a page's policy may forbid workers.
   #early = [];
-  /// The array that is passed back and forth.
-  #array = null;
+  /// The arrays that are passed back and forth.
+  #spare = [];
 
-  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible
-  /// at the requested time, the farthest first; it is valid during the call only.
+  /// `onorder({orders, active, left, ms, generation})`: the first `count` of the `order` of each requested view are the
+  /// Gaussians that are visible at the requested time, the farthest first; valid during the call only. `left`: those
+  /// that the fovea leaves out.
   constructor(near, onorder) {
     this.#near = near;
     this.#onorder = onorder;
@@ -44,9 +45,9 @@ export class Order {
   }
 
   /// A page whose arrays are the order's from now on, and its first row in the texture.
-  add({ id, count, words, headers }, { from, to }, row) {
+  add({ id, count, words, headers }, { from, to, tier }, row) {
     this.generation++;
-    this.#tell({ add: { id, row, count, words, headers, from, to } }, [words.buffer, headers.buffer]);
+    this.#tell({ add: { id, row, count, words, headers, from, to, tier } }, [words.buffer, headers.buffer]);
   }
 
   drop(id) {
@@ -60,13 +61,14 @@ export class Order {
     this.#tell({ page, mask: { keys, rows, stride } }, [keys.buffer, rows.buffer]);
   }
 
-  /// Requests the order at `time` seen by `m` (camera from world, 3x4); none may be on its way.
-  ask(time, m) {
+  /// Requests the orders at `time` seen by `views` (camera from world, 3x4); none may be on its way. `fovea`: of
+  /// fovea.js, or null.
+  ask(time, views, fovea = null) {
     this.busy = true;
-    const array = this.#array,
-      sort = { time, depth: [m[8], m[9], m[10], m[11]], near: this.#near };
-    this.#array = null;
-    this.#tell({ sort, generation: this.generation, order: array }, array ? [array.buffer] : []);
+    const spare = this.#spare,
+      sort = { time, views: views.map((m) => [...m]), near: this.#near, fovea };
+    this.#spare = [];
+    this.#tell({ sort, generation: this.generation, spare }, spare.map((array) => array.buffer));
   }
 
   destroy() {
@@ -86,21 +88,20 @@ export class Order {
     for (const [message] of this.#early.splice(0)) this.#answer(message);
   }
 
-  #answer({ add, drop, page, mask, sort, generation, order }) {
+  #answer({ add, drop, page, mask, sort, generation, spare }) {
     if (add) return this.#sorter.add(add);
     if (drop !== undefined) return this.#sorter.drop(drop);
     if (mask) return this.#sorter.mask(page, mask);
     const begin = performance.now();
-    const array = this.#sorter.room(order);
-    const { count, active } = this.#sorter.sort(sort, array);
+    const { orders, active, left } = this.#sorter.orders(sort, spare);
     const ms = performance.now() - begin;
     // Later, like a worker's result: the caller has finished its own work then.
-    setTimeout(() => this.#arrived({ order: array, count, active, ms, generation }), 0);
+    setTimeout(() => this.#arrived({ orders, active, left, ms, generation }), 0);
   }
 
   #arrived(answer) {
     this.busy = false;
-    this.#array = answer.order;
+    this.#spare = answer.orders.map((o) => o.order);
     this.#onorder(answer);
   }
 }

@@ -40,3 +40,6 @@ if (token) {
   element.addEventListener('load', () => import('./edit.js').then(m => m.Editing.start(element.face, token))
     .catch(error => element.face.toast(error.message, 8000)), { once: true });
 }
+if (new URLSearchParams(location.search).has('measure')) {
+  element.addEventListener('load', () => import('./measure.js').then(m => m.report(element)), { once: true });
+}

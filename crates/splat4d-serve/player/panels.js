@@ -196,7 +196,7 @@ export function figuresCard(player) {
       ['Frame', s.frameMs ? `${s.frameMs.toFixed(1)} ms` : '–'],
       ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
       ['Image', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
-      ['Rendered', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
+      ['Rendered', count(s.drawn)], ...(s.foveated ? [['Left out at the edges', count(s.foveated)]] : []), ['Active', count(s.active)], ['Resident', count(s.resident)],
       ...(s.ladder ? [['Bit rate', `rung ${s.ladder.rung} of ${s.ladder.rungs} (${REASONS[s.ladder.reason]})`],
         ['Left out', count(s.ladder.leftOut)]] : []),
       ...(isFinite(s.megabits) && s.megabits ? [['Connection', `${s.megabits.toFixed(1)} Mbit/s`]] : []),

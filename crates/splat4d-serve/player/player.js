@@ -73,7 +73,7 @@ export class Player extends EventTarget {
   film = null;
   buffered = [];
   ladder = new Ladder();
-  figures = { firstFrame: 0 };
+  figures = { firstFrame: 0, frames: 0 };
   #speed = 1;
   #pace = new Pace();
   #interval = 0;
@@ -700,7 +700,7 @@ export class Player extends EventTarget {
   }
 
   /** A frame took `ms`: a device that is too slow renders a lower rung (`Ladder.frame`). */
-  frameTook(ms, now, limits) { this.ladder.frame(ms, now, this.#stream?.shown(this.time).rung ?? 0, limits); }
+  frameTook(ms, now, limits) { this.figures.frames++; this.ladder.frame(ms, now, this.#stream?.shown(this.time).rung ?? 0, limits); }
 
   /** 'auto', or the rung of the ladder that alone is rendered, 1 the coarsest. */
   get rung() { return this.#pin === null ? 'auto' : this.#pin + 1; }
@@ -776,7 +776,7 @@ export class Player extends EventTarget {
   }
 
   /** While a headset draws, the page does not. */
-  set immersed(on) { this.#xr = on; this.#told.size = null; this.redraw(); }
+  set immersed(on) { this.#xr = on; this.#told.size = null; this.redraw(); this.emit('immersed', { on }); }
   advance(dt) {
     this.#last = performance.now();
     if (this.#stream) this.#moveTime(dt);

@@ -16,6 +16,17 @@ const SAME_FRAME = 2;
 /// A camera that turned further than this since its order was requested (cosine) gets no frame of its own: Gaussians
 /// behind the earlier camera are missing in that order.
 const TURN_MAX = Math.cos(Math.PI / 6);
+/// Eyes whose axes are turned apart further than this (cosine) get an order each. A shift changes no order by depth: along
+/// an axis it adds the same to all depths, across it nothing.
+const CANTED = Math.cos(Math.PI / 180);
+
+/// The views, of the eyes of one frame, that need an order of their own: one, or two.
+export function sorted(eyes) {
+  const [first] = eyes,
+    axis = (view) => view.cameraFromWorld.slice(8, 11),
+    along = (view) => axis(first).reduce((sum, x, k) => sum + x * axis(view)[k], 0);
+  return eyes.some((view) => along(view) < CANTED) ? eyes.slice(0, 2) : [first];
+}
 
 /// Moves a clock by `step` seconds within `clip` {first, last, frameTime, loop}. The last frame is shown as long as the
 /// others, so that a loop lasts `last + frameTime - first`. Returns {time, ended}.
@@ -55,7 +66,7 @@ export class Schedule {
 
   /// What is to be shown: `time` now; `at(ms)`, where a clock runs, the time at a later `performance.now()`, null where
   /// that cannot be rendered yet; `epoch` counts jumps of the clock; `view` the camera, `cameraFromWorld` its 3x4
-  /// matrix.
+  /// matrix; `eyes` all cameras of a headset's frame; `fovea` what their edges leave out (fovea.js).
   want(wanted, now) {
     if (wanted.epoch !== this.#wanted?.epoch) this.#due = -Infinity;
     this.#wanted = wanted;
@@ -70,7 +81,7 @@ export class Schedule {
     if (this.#order.busy) return true;
     const wanted = this.#wanted;
     if (!wanted) return false;
-    const { at, epoch, view } = wanted;
+    const { at, epoch, view, eyes = null, fovea = null } = wanted;
     let { time } = wanted;
     if (at) {
       // A finished one is rendered first; where sorting takes longer than a frame, the next is computed meanwhile.
@@ -82,16 +93,18 @@ export class Schedule {
       if (time === null) return false;
     }
     const { generation } = this.#order,
-      m = view.cameraFromWorld,
-      have = this.current;
-    if (have && Object.is(have.time, time) && have.generation === generation && sameDepth(have.depth, m)) {
+      views = (eyes ? sorted(eyes) : [view]).map((v) => v.cameraFromWorld),
+      depths = views.map((m) => [m[8], m[9], m[10], m[11]]),
+      have = this.current,
+      same = have && Object.is(have.time, time) && have.generation === generation && have.fovea === fovea;
+    if (same && have.depths.join() === depths.join()) {
       // A jump to where it is already needs no order.
       have.epoch = epoch;
       if (this.#rendered === have) this.shown = { time, epoch };
       return false;
     }
-    this.#asked = { time, epoch, view, generation, depth: [m[8], m[9], m[10], m[11]], now, ahead: !!at };
-    this.#order.ask(time, m);
+    this.#asked = { time, epoch, view, generation, depths, fovea, now, ahead: !!at };
+    this.#order.ask(time, views, fovea);
     return true;
   }
 
@@ -131,7 +144,7 @@ export class Schedule {
 
   /// The camera of the next image: the newest one, or after a cut the one that the order was computed for.
   viewOf(newest) {
-    const { depth, view } = this.current,
+    const { depths: [depth], view } = this.current,
       m = newest.cameraFromWorld;
     const turned = depth[0] * m[8] + depth[1] * m[9] + depth[2] * m[10] < TURN_MAX;
     return turned && view.width === newest.width && view.height === newest.height ? view : newest;
@@ -143,10 +156,6 @@ export class Schedule {
     this.#due = -Infinity;
     this.#least = this.#order.generation;
   }
-}
-
-function sameDepth(depth, m) {
-  return depth.every((x, k) => Object.is(x, m[8 + k]));
 }
 
 /// Follows a clock that a page sets itself, and predicts it: how fast it runs, and that it begins again.

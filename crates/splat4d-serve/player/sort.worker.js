@@ -19,6 +19,9 @@ const SLACK = 1e-5;
 /// Opacity below which nothing is drawn (Kerbl et al. 2023).
 const ALPHA_MIN = 1 / 255;
 
+/// Standard deviations within which a Gaussian can be seen: an opaque one reaches 1/255 at 3.3.
+const FOOTPRINT = 3.3;
+
 /// Softnesses that belong to the reach of a Gaussian that dies (docs/format.md).
 const REACH_TAILS = 3;
 
@@ -46,6 +49,14 @@ function path(words, headers, i, span, out) {
   out[8] = soft;
   out[9] = (words[w + 2] >>> 24) / 255;
   out[10] = reach;
+}
+
+/// The largest standard deviation of Gaussian `i`.
+function largest(words, headers, i) {
+  const word = words[WORDS * i + 2],
+    f = HEADER * Math.floor(i / BLOCK);
+  const code = Math.max(word & 255, (word >>> 8) & 255, (word >>> 16) & 255);
+  return Math.exp(lerp(headers[f + 10], headers[f + 11], code / 255));
 }
 
 /// The numbers of the key times around `t`, of rising `keys`: [last ≤ t, first ≥ t]; outside of all, the nearest twice.
@@ -109,6 +120,12 @@ function ones(word) {
   return Math.imul((word + (word >>> 4)) & 0x0f0f0f0f, 0x01010101) >>> 24;
 }
 
+/// What a view (camera from world, 3x4) sorts by: `depth` [a, b, c, d] of z = a·x + b·y + c·z + d, and its `center`.
+function sight(m) {
+  const center = [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]));
+  return { depth: [m[8], m[9], m[10], m[11]], center };
+}
+
 /// Holds what sorting needs of each resident page.
 class Sorter {
   #pages = [];
@@ -120,10 +137,11 @@ class Sorter {
   #range = new Float32Array(2);
 
   /// `page`: {id, row: its first row in the texture, count, words, headers, from, to}.
-  add({ id, row, count, words, headers, from, to }) {
+  add({ id, row, count, words, headers, from, to, tier = 0 }) {
     const track = new Float32Array(TRACK * count),
       p = new Float64Array(11);
-    const blocks = new Float64Array(2 * Math.ceil(count / BLOCK));
+    const blocks = new Float64Array(2 * Math.ceil(count / BLOCK)),
+      sizes = new Float32Array(count);
     for (let i = 0; i < count; i++) {
       path(words, headers, i, to - from, p);
       const o = TRACK * i,
@@ -132,6 +150,7 @@ class Sorter {
         track[o + k] = p[k] - p[4 + k] * c;
         track[o + 3 + k] = p[4 + k];
       }
+      sizes[i] = largest(words, headers, i);
       // σ falls to where o·σ = 1/255 at this distance outside the half-width.
       const tail = p[9] < ALPHA_MIN ? NaN : p[8] * Math.sqrt(2 * Math.log(p[9] / ALPHA_MIN));
       track[o + 6] = p[9] < ALPHA_MIN ? Infinity : p[7] === Infinity ? -Infinity : c - p[7] - tail - SLACK;
@@ -141,7 +160,7 @@ class Sorter {
       blocks[2 * b] = Math.min(blocks[2 * b], track[o + 6]);
       blocks[2 * b + 1] = Math.max(blocks[2 * b + 1], track[o + 7]);
     }
-    this.#pages.push({ id, row, count, from, to, track, blocks, mask: null });
+    this.#pages.push({ id, row, count, from, to, tier, track, blocks, sizes, mask: null });
     // The order of equal depths is that of numbers, whenever a page arrived.
     this.#pages.sort((a, b) => a.id - b.id);
   }
@@ -167,10 +186,26 @@ class Sorter {
     return this.#pages.reduce((n, p) => n + p.count, 0);
   }
 
+  /// The orders of `views` (camera from world, 3x4) at `time`, in the arrays `spare` where they are large enough:
+  /// {orders: [{order, count}], active, left}.
+  orders({ time, views, near, fovea }, spare = []) {
+    let active = 0,
+      left = 0;
+    const orders = views.map((m, k) => {
+      const order = this.room(spare[k]),
+        sorted = this.sort({ time, ...sight(m), near, fovea }, order);
+      active = sorted.active;
+      left = Math.max(left, sorted.left);
+      return { order, count: sorted.count };
+    });
+    return { orders, active, left };
+  }
+
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this time's
-  /// pages that their key masks admit}.
-  sort({ time, depth: [a, b, c, d], near }, out) {
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. `fovea` (fovea.js) leaves out those of higher tiers away from the
+  /// axis of a camera at `center`. Returns {count, active: Gaussians of this time's pages that their key masks admit, left: those
+  /// that the fovea leaves out}.
+  sort({ time, depth: [a, b, c, d], center = [0, 0, 0], near, fovea = null }, out) {
     const total = this.total;
     if (this.#depths.length < total) {
       this.#depths = new Float32Array(total);
@@ -183,15 +218,18 @@ class Sorter {
       ids = this.#ids,
       keys = this.#keys,
       starts = this.#starts;
+    const [ex, ey, ez] = center;
     let n = 0,
       active = 0,
+      left = 0,
       low = Infinity,
       high = 0;
-    for (const { row, count, from, to, track, blocks, mask } of this.#pages) {
+    for (const { row, count, from, to, tier, track, blocks, sizes, mask } of this.#pages) {
       if (!(from <= time && time < to)) continue;
       mask?.at(time);
       active += mask?.count ?? count;
-      const admitted = mask?.bits ?? null;
+      const admitted = mask?.bits ?? null,
+        edge = fovea !== null && tier >= fovea.tier;
       const t = time - from;
       for (let block = 0, first = 0; first < count; block++, first += BLOCK) {
         if (!(t >= blocks[2 * block] && t <= blocks[2 * block + 1])) continue;
@@ -199,13 +237,20 @@ class Sorter {
         for (let i = first, o = TRACK * first; i < end; i++, o += TRACK) {
           if (t < track[o + 6] || t > track[o + 7]) continue;
           if (admitted !== null && !((admitted[i >> 5] >>> (i & 31)) & 1)) continue;
-          const z =
-            a * (track[o] + track[o + 3] * t) +
-            b * (track[o + 1] + track[o + 4] * t) +
-            c * (track[o + 2] + track[o + 5] * t) +
-            d;
+          const x = track[o] + track[o + 3] * t,
+            y = track[o + 1] + track[o + 4] * t,
+            w = track[o + 2] + track[o + 5] * t,
+            z = a * x + b * y + c * w + d;
           // Phrased so that a NaN is left out too.
           if (!(z > near && z < Infinity)) continue;
+          if (edge) {
+            // The square of its distance from the camera's axis; a footprint that reaches the middle stays.
+            const off = (x - ex) ** 2 + (y - ey) ** 2 + (w - ez) ** 2 - z * z;
+            if (Math.sqrt(Math.max(off, 0)) - fovea.inner * z > FOOTPRINT * sizes[i]) {
+              left++;
+              continue;
+            }
+          }
           depths[n] = z;
           ids[n++] = row * ROW + i;
           if (z < low) low = z;
@@ -213,7 +258,7 @@ class Sorter {
         }
       }
     }
-    if (!n) return { count: 0, active };
+    if (!n) return { count: 0, active, left };
     // The bits of positive floats grow like their logarithm, bent a little: near and far get alike fine steps.
     this.#range[0] = low;
     this.#range[1] = high;
@@ -233,7 +278,7 @@ class Sorter {
     }
     // Equal depths are ordered by number front to back, so reversed back to front.
     for (let i = n - 1; i >= 0; i--) out[starts[keys[i]]++] = ids[i];
-    return { count: n, active };
+    return { count: n, active, left };
   }
 }
 
@@ -246,10 +291,9 @@ if (typeof WorkerGlobalScope !== 'undefined' && self instanceof WorkerGlobalScop
     if (data.drop !== undefined) return sorter.drop(data.drop);
     if (data.mask) return sorter.mask(data.page, data.mask);
     const begin = performance.now();
-    const order = sorter.room(data.order);
-    const { count, active } = sorter.sort(data.sort, order);
+    const { orders, active, left } = sorter.orders(data.sort, data.spare);
     const ms = performance.now() - begin;
-    self.postMessage({ order, count, active, ms, generation: data.generation }, [order.buffer]);
+    self.postMessage({ orders, active, left, ms, generation: data.generation }, orders.map((o) => o.order.buffer));
   };
   self.postMessage({ ready: true });
 }

@@ -34,7 +34,7 @@ export class WebGL2Backend {
   }
 
   name = 'webgl2';
-  stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
+  stats = { resident: 0, active: 0, drawn: 0, foveated: 0, sortMs: 0, drawMs: 0 };
   #canvas;
   #gl;
   #lost;
@@ -58,11 +58,13 @@ export class WebGL2Backend {
   /// Rows of dropped pages: [{row, count, generation}]. The order on the screen may still name them.
   #retired = [];
   #clip = [0, 0];
-  /// The worker's orders, in two textures in turn: `#front` is rendered, its first `#count` numbers; the other one
-  /// holds the order that is rendered next, with its figures.
+  /// The worker's orders, in two sets in turn: `#front` is rendered; the other one is rendered next, with its figures.
+  /// A set has an order, or one for each eye. `#eye`: the one that is being rendered, its first `#count` numbers.
   #order;
-  #orders = [0, 1].map(() => ({ texture: null, rows: 0 }));
+  #orders = [0, 1].map(() => [0, 1].map(() => ({ texture: null, rows: 0, count: 0 })));
+  #kinds = 1;
   #front = 0;
+  #eye = 0;
   #count = 0;
   #next = null;
   #schedule;
@@ -251,15 +253,16 @@ export class WebGL2Backend {
   /// Renders the newest order at its time with the newest camera, and requests the next one: `time`, `at` and `epoch`
   /// are what Schedule.want takes. Returns false where there is nothing new to show, or no order yet; `force` renders
   /// what there is in any case. `target` {framebuffer, x, y}: where the image goes instead of the canvas (a headset's).
-  /// `background` null: nothing, premultiplied.
+  /// `eyes`: the views of all images of this frame, of which this is number `eye`. `fovea`: of fovea.js. `background`
+  /// null: nothing, premultiplied.
   draw({
     time, at = null, epoch = 0, view, channel = 'color', background = [0, 0, 0], depthRange = [0, 1], flowScale = 100,
-    target = null, force = false,
+    target = null, force = false, eyes = null, eye = 0, fovea = null,
   }) {
     const clamped = (t) => (t === null ? t : Math.min(Math.max(t, this.#clip[0]), this.#clip[1]));
     const now = performance.now();
-    this.#last = { view, channel, background, depthRange, flowScale, target, moving: !!at };
-    this.#schedule.want({ time: clamped(time), at: at && ((ms) => clamped(at(ms))), epoch, view }, now);
+    this.#last = { view, channel, background, depthRange, flowScale, target, moving: !!at, eye };
+    this.#schedule.want({ time: clamped(time), at: at && ((ms) => clamped(at(ms))), epoch, view, eyes, fovea }, now);
     // First the order that is there: the request that follows takes the newest latency and camera.
     const drawn = this.#redraw(force || !!target);
     this.#schedule.ask(now);
@@ -300,7 +303,7 @@ export class WebGL2Backend {
     this.#canvas.removeEventListener('webglcontextlost', this.#lost);
     const gl = this.#gl;
     for (const t of [this.#words, this.#blocks, this.#palette, this.#sums.texture]) gl.deleteTexture(t);
-    for (const t of [...this.#orders.map((o) => o.texture), ...(this.#splats?.textures ?? [])]) gl.deleteTexture(t);
+    for (const t of [...this.#orders.flat().map((o) => o.texture), ...(this.#splats?.textures ?? [])]) gl.deleteTexture(t);
     for (const a of [this.#empty, this.#quads]) gl.deleteVertexArray(a);
     gl.deleteBuffer(this.#corners);
     gl.deleteFramebuffer(this.#sums.frame);
@@ -353,15 +356,23 @@ export class WebGL2Backend {
 
   // Order
 
-  #ordered({ order, count, active, ms, generation }) {
+  #ordered({ orders, active, left, ms, generation }) {
     const now = performance.now();
     if (this.#gl.isContextLost()) return this.#wake();
     if (!this.#schedule.arrived(now)) {
       this.#schedule.ask(now);
       return this.#wake();
     }
+    orders.forEach((made, k) => this.#keep(made, this.#orders[1 - this.#front][k]));
+    this.#next = { kinds: orders.length, active, left, ms, generation };
+    this.#schedule.ask(now);
+    this.#wake();
+    this.#onorder();
+  }
+
+  /// Writes an order into the texture of `back`.
+  #keep({ order, count }, back) {
     const gl = this.#gl,
-      back = this.#orders[1 - this.#front],
       rows = Math.ceil(count / ORDER_WIDTH);
     if (back.rows < rows) {
       gl.deleteTexture(back.texture);
@@ -373,10 +384,7 @@ export class WebGL2Backend {
       gl.bindTexture(gl.TEXTURE_2D, back.texture);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order, 0);
     }
-    this.#next = { count, active, ms, generation };
-    this.#schedule.ask(now);
-    this.#wake();
-    this.#onorder();
+    back.count = count;
   }
 
   #wake() {
@@ -403,6 +411,8 @@ export class WebGL2Backend {
     const begin = performance.now();
     if (schedule.fresh) this.#turn();
     if (schedule.current) schedule.rendered(begin);
+    this.#eye = Math.min(last.eye, this.#kinds - 1);
+    this.#count = schedule.current ? this.#orders[this.#front][this.#eye].count : 0;
     this.#timer.begin();
     const { width, height } = view;
     if (this.#size[0] !== width || this.#size[1] !== height) this.#room(width, height);
@@ -427,10 +437,10 @@ export class WebGL2Backend {
 
   /// Applies the latest order.
   #turn() {
-    const { count, active, ms, generation } = this.#next;
+    const { kinds, active, left, ms, generation } = this.#next;
     this.#front = 1 - this.#front;
-    this.#count = count;
-    Object.assign(this.stats, { active, drawn: count, sortMs: ms });
+    this.#kinds = kinds;
+    Object.assign(this.stats, { active, drawn: this.#orders[this.#front][0].count, foveated: left, sortMs: ms });
     // What this order no longer names may be overwritten.
     this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
   }
@@ -446,7 +456,7 @@ export class WebGL2Backend {
     this.#bind(at, 'words', 0, this.#words);
     this.#bind(at, 'blocks', 1, this.#blocks);
     this.#bind(at, 'palette', 2, this.#palette);
-    this.#bind(at, 'order', 3, this.#orders[this.#front].texture);
+    this.#bind(at, 'order', 3, this.#orders[this.#front][this.#eye].texture);
     for (let k = 0; k < 9; k++) SCRATCH[k] = m[4 * (k % 3) + Math.floor(k / 3)];
     gl.uniformMatrix3fv(at.rotation, false, SCRATCH);
     gl.uniform3f(at.translation, m[3], m[7], m[11]);
@@ -483,7 +493,7 @@ export class WebGL2Backend {
     gl.bindFramebuffer(gl.FRAMEBUFFER, splats.frame);
     if (splats.rows < rows) {
       for (const t of splats.textures) gl.deleteTexture(t);
-      splats.rows = this.#orders[this.#front].rows;
+      splats.rows = this.#orders[this.#front][this.#eye].rows;
       const points = [0, 1, 2].map((k) => gl.COLOR_ATTACHMENT0 + k);
       splats.textures = points.map((point) => {
         const made = texture(gl, gl.RGBA32F, ORDER_WIDTH, splats.rows);

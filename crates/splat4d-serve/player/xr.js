@@ -1,9 +1,11 @@
 // Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's image. Tested: that no
 // button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset.
 // Never tested for lack of a device: a real headset, its frame rate, and how the order by depth, which WebGL2 computed
-// for the head of some frames ago, appears while the head turns. Both eyes show the time of one order.
+// for the head of some frames ago, appears while the head turns. Both eyes show the same time: eyes with parallel axes have
+// one order, which is exact for both, canted ones get an order each (schedule.js).
 
 import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.js';
+import { Fovea } from './fovea.js';
 
 /** A scene that states no unit is shown this large, metres from its middle: a dolls' house on a table. */
 const TABLE_RADIUS = 0.6;
@@ -96,23 +98,27 @@ export async function enter(player, mode = 'immersive-vr') {
     if (ray) standing?.tap(ray.transform);
   });
   player.immersed = true;
-  let last = 0;
+  let last = 0, fovea = new Fovea(player);
   const tick = (now, frame) => {
     session.requestAnimationFrame(tick);
     player.advance(Math.min((now - last) / 1000, 0.1));
-    // A headset that misses two of three frames is too slow for the rung; fewer pixels are not tried there.
-    const period = 1000 / (session.frameRate || RATE);
-    if (last) player.frameTook(now - last, now, { slow: 1.5 * period, fast: 1.15 * period });
+    // A headset that misses two of three frames is too slow: it thins the edges, then drops a rung. Fewer pixels are not
+    // tried there.
+    const period = 1000 / (session.frameRate || RATE), limits = { slow: 1.5 * period, fast: 1.15 * period };
+    if (fovea.file !== player.file) fovea = new Fovea(player);
+    if (last) player.frameTook(now - last, now, fovea.frame(now - last, now, player.ladder, limits));
     last = now;
+    // Null where the layer offers none. It coarsens only the copy to the headset: splats are blended before it.
+    if (layer.fixedFoveation != null) layer.fixedFoveation = fovea.strength;
     const viewer = frame.getViewerPose(space);
     if (viewer && standing && !standing.placed) standing.ahead(viewer.transform);
-    for (const eye of viewer?.views ?? []) {
-      const { x, y, width, height } = layer.getViewport(eye);
+    const ports = (viewer?.views ?? []).map(eye => layer.getViewport(eye));
+    const eyes = ports.map(({ width, height }, k) => eyeView(viewer.views[k], start, unit, width, height));
+    ports.forEach(({ x, y, width, height }, eye) => {
       const drawing = player.drawing(width, height);
       if (ar) drawing.background = null;
-      player.backend.draw({ ...drawing, view: eyeView(eye, start, unit, width, height),
-        target: { framebuffer: layer.framebuffer, x, y } });
-    }
+      player.backend.draw({ ...drawing, view: eyes[eye], eyes, eye, fovea: fovea.edge, target: { framebuffer: layer.framebuffer, x, y } });
+    });
   };
   session.requestAnimationFrame(tick);
   await new Promise(done => session.addEventListener('end', done));

@@ -44,7 +44,7 @@
 //! | `events.rs` | events of a live run: one bounded log |
 //! | `answer.rs`, `server.rs` | routes and headers; start, stop, accept: one thread, bounded memory |
 //! | `no_server.rs` | in place of the server without the feature `server` |
-//! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete, of the rung of a bitrate ladder that `ladder.js` chooses; the others hold the last frame |
+//! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete, of the rung of a bitrate ladder that `ladder.js` chooses; the others hold the last frame. In a headset, `fovea.js` states what the edges of the view leave out |
 
 #![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature
 #![cfg_attr(not(feature = "server"), allow(dead_code))] // without the server nothing asks for the page's files

@@ -405,6 +405,9 @@ impl Work {
             console.written(&report::write(&Run::open(&self.dir)?)?);
         }
         console.written(&self.dir.join(playable::FILE));
+        if let Some(command) = baking::ladder::again(&playable::ladder(&self.order.source), &self.dir) {
+            console.result(&format!("the bitrate ladder of the source is not kept; bake it again: {command}"));
+        }
         console.emit(&json!({"type": "compressed", "run": self.dir.to_string_lossy(), "bytes": file.bytes}));
         Ok(())
     }

@@ -9,7 +9,7 @@ use crate::folding::fold;
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
-use splat4d::format::playback::{self, HEADER_BYTES, Index, MAGIC};
+use splat4d::format::playback::{self, HEADER_BYTES, Index, MAGIC, Rung};
 use splat4d_serve::Content;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -82,6 +82,11 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
     let file = files::open(path)?;
     file.take(MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| cannot_read(path, e))?;
     Ok((start == MAGIC).then(|| path.to_owned()))
+}
+
+/// The bitrate ladder of the playback file that is there already; empty without either.
+pub(crate) fn ladder(path: &Path) -> Vec<Rung> {
+    ready(path).ok().flatten().and_then(|file| index(&file).ok()).map_or_else(Vec::new, |index| index.meta.ladder)
 }
 
 /// A playback file's index; the rest is not read. A damaged file is reported here rather than in a browser.

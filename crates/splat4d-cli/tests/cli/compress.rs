@@ -3,6 +3,7 @@
 use crate::sample::{Capture, splat4d};
 use crate::{json_of, str, train};
 use serde_json::Value;
+use std::path::Path;
 
 #[test]
 fn a_run_is_compressed_and_measured_before_and_after() {
@@ -113,4 +114,27 @@ fn invalid_options_are_refused_before_any_work() {
     std::fs::remove_file(run.join("scene.safetensors")).unwrap();
     assert!(refused(&[run_text]).contains("train --resume"));
     assert!(!work.path().join("run-compressed").exists(), "nothing was begun");
+}
+
+#[test]
+fn a_ladder_that_is_not_kept_is_reported_with_the_command_that_bakes_it() {
+    let work = tempfile::tempdir().unwrap();
+    let [run, plain, ladder, dir] = ["run", "plain.s4d", "ladder.s4d", "small"].map(|name| work.path().join(name));
+    let capture = Capture::new(work.path()).write();
+    train(&capture, &run).ok();
+    let compress = |scene: &Path, dir: &Path| {
+        let quick = ["--level", "1", "--fine-tune", "0", "--no-eval", "-o", str(dir)];
+        splat4d(&["compress", str(scene), "--capture", str(&capture)]).args(&quick).run().all()
+    };
+    splat4d(&["bake", str(&run), "-o", str(&plain)]).run().ok();
+    assert!(!compress(&plain, &work.path().join("without")).contains("bitrate ladder"));
+    splat4d(&["bake", str(&run), "-o", str(&ladder), "--ladder", "5,50"]).run().ok();
+    let said = compress(&ladder, &dir);
+    let command =
+        said.split("bake it again: splat4d ").nth(1).unwrap_or_else(|| panic!("{said}")).lines().next().unwrap();
+    let arguments: Vec<&str> = command.split(' ').collect();
+    assert_eq!(arguments[..2], ["bake", str(&dir)]);
+    splat4d(&arguments).run().ok();
+    let again = splat4d(&["info", arguments[3]]).run().ok();
+    assert!(again.contains("rung 1 of"), "{again}");
 }

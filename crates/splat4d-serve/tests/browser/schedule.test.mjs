@@ -2,7 +2,7 @@
 
 import assert from 'node:assert/strict';
 import test from 'node:test';
-import { Follower, Schedule, advance } from '../../player/schedule.js';
+import { Follower, Schedule, advance, sorted } from '../../player/schedule.js';
 
 const CLIP = { first: 0, last: 1, frameTime: 0.1, loop: true };
 const VIEW = { cameraFromWorld: Float64Array.from([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]), width: 4, height: 3 };
@@ -211,6 +211,28 @@ test('one slow frame does not send the clock far ahead', () => {
   m.frame = 16;
   m.frames(20);
   for (const [now, time] of m.rendered.slice(-15)) assert.ok(time - now / 1000 < 0.03, `${time} at ${now} ms`);
+});
+
+test('eyes with parallel axes have one order, canted ones an order each', () => {
+  /// An eye that is turned by `degrees` about y, `x` to the right.
+  const eye = (degrees, x) => {
+    const [c, s] = [Math.cos, Math.sin].map((f) => f((degrees * Math.PI) / 180));
+    return { cameraFromWorld: Float64Array.from([c, 0, s, -x, 0, 1, 0, 0, -s, 0, c, 0]) };
+  };
+  const parallel = [eye(0, -0.03), eye(0, 0.03)],
+    canted = [eye(-2.5, -0.03), eye(2.5, 0.03)];
+  assert.deepEqual(sorted(parallel), [parallel[0]]);
+  assert.deepEqual(sorted(canted), canted);
+  assert.deepEqual(sorted([eye(0, 0)]).length, 1);
+  const requests = [],
+    schedule = new Schedule({ busy: false, generation: 1, ask: (time, views) => requests.push(views.length) });
+  for (const eyes of [parallel, canted]) {
+    schedule.want({ time: 0, at: null, epoch: 0, view: eyes[0], eyes }, 0);
+    schedule.ask(0);
+    schedule.arrived(1);
+    assert.equal(schedule.ask(2), false, 'nothing moved: no order is requested');
+  }
+  assert.deepEqual(requests, [1, 2]);
 });
 
 test("a page's own clock is predicted: its speed, its loop, and that it stops", () => {

@@ -164,3 +164,119 @@ test('in a simulated room the scene is on the floor, and a tap moves it', option
   assert.equal(seen.buttons, 1);
   assert.deepEqual(errors, []);
 });
+
+test('canted eyes are rendered in their own orders, and edges are left out around a whole middle', options, async (t) => {
+  const { page, errors } = await prepared(t);
+  const seen = await page.evaluate(async () => {
+    const element = document.querySelector('splat-4d'),
+      { player } = element,
+      { backend } = player;
+    await element.settled();
+    const { eyeView } = await import('/player/xr.js');
+    // The page renders nothing of its own meanwhile.
+    player.immersed = true;
+    const size = 96,
+      projectionMatrix = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, -1, 0, 0, -0.02, 0],
+      start = player.camera.clone();
+    /// An eye that is turned outwards by half of `degrees`.
+    const eye = (right, degrees) => {
+      const half = ((right ? -1 : 1) * degrees * Math.PI) / 720,
+        orientation = { w: Math.cos(half), x: 0, y: Math.sin(half), z: 0 };
+      return eyeView({ transform: { position: { x: right ? 0.03 : -0.03, y: 0, z: 0 }, orientation }, projectionMatrix }, start, 0.1, size, size);
+    };
+    backend.resize(size, size);
+    const render = async (view, more) => {
+      const what = { ...player.drawing(size, size), view, force: true, ...more };
+      backend.draw(what);
+      await backend.settled();
+      backend.draw(what);
+      return { data: (await backend.readPixels()).data, ...backend.stats };
+    };
+    /// Pixels that differ; `middle`: of the middle third only.
+    const differ = (a, b, middle = false) => {
+      let n = 0;
+      for (let i = 0; i < size * size; i++) {
+        const inside = [i % size, Math.floor(i / size)].every((x) => Math.abs(x + 0.5 - size / 2) < size / 6);
+        if (!middle || inside) n += [0, 1, 2].some((c) => a.data[4 * i + c] !== b.data[4 * i + c]) ? 1 : 0;
+      }
+      return n;
+    };
+    const eyes = [eye(false, 20), eye(true, 20)],
+      own = [await render(eyes[0]), await render(eyes[1])],
+      both = [await render(eyes[0], { eyes, eye: 0 }), await render(eyes[1], { eyes, eye: 1 })],
+      shared = await render(eyes[1], { eyes: [eyes[0]], eye: 1 }),
+      parallel = [eye(false, 0), eye(true, 0)],
+      alone = await render(parallel[1]),
+      one = await render(parallel[1], { eyes: parallel, eye: 1 }),
+      thin = await render(parallel[1], { eyes: parallel, eye: 1, fovea: { inner: Math.SQRT2 / 3, tier: 1 } });
+    return {
+      canted: [differ(own[0], both[0]), differ(own[1], both[1])],
+      shared: differ(own[1], shared),
+      parallel: differ(alone, one),
+      edges: differ(one, thin),
+      middle: differ(one, thin, true),
+      drawn: [one.drawn, thin.drawn],
+      foveated: [one.foveated, thin.foveated],
+    };
+  });
+  t.diagnostic(JSON.stringify(seen));
+  assert.deepEqual(seen.canted, [0, 0], 'each eye as if it were alone');
+  assert.ok(seen.shared > 0, 'the order of the other eye renders something else');
+  assert.equal(seen.parallel, 0, 'one order is exact for parallel eyes');
+  assert.equal(seen.foveated[0], 0);
+  assert.ok(seen.foveated[1] > 0 && seen.drawn[1] === seen.drawn[0] - seen.foveated[1]);
+  assert.ok(seen.edges > 0 && seen.middle <= seen.edges / 50, 'the middle third is whole');
+  assert.deepEqual(errors, []);
+});
+
+test('a headset whose frames are late thins the edges, and reports it', options, async (t) => {
+  const { page, errors } = await prepared(t);
+  const seen = await page.evaluate(async () => {
+    const { player } = document.querySelector('splat-4d');
+    const { enter } = await import('/player/xr.js');
+    // The session's own times are ten times as long: no machine renders frames of 2 ms.
+    const request = XRSession.prototype.requestAnimationFrame;
+    XRSession.prototype.requestAnimationFrame = function (callback) {
+      return request.call(this, (now, frame) => callback(10 * now, frame));
+    };
+    // A layer that offers fixed foveation.
+    const strengths = [];
+    Object.defineProperty(XRWebGLLayer.prototype, 'fixedFoveation', { get: () => strengths.at(-1) ?? 0, set: (x) => strengths.push(x) });
+    const ended = enter(player);
+    const whole = player.statistics.foveated;
+    for (let i = 0; i < 600 && !player.statistics.foveated; i++) await new Promise((done) => setTimeout(done, 50));
+    const { foveated, drawn } = player.statistics;
+    await window.device.activeSession.end();
+    await ended;
+    return { whole, foveated, drawn, first: strengths[0], last: strengths.at(-1) };
+  });
+  t.diagnostic(JSON.stringify(seen));
+  assert.ok(seen.whole === 0 && seen.foveated > 0 && seen.drawn > 0);
+  assert.deepEqual([seen.first, seen.last], [0, 1]);
+  assert.deepEqual(errors, []);
+});
+
+test('a page measures its device, then the headset', options, async (t) => {
+  const { page, errors } = await prepared(t);
+  const seen = await page.evaluate(async () => {
+    const element = document.querySelector('splat-4d'),
+      { player } = element,
+      { measure } = await import('/player/measure.js'),
+      { enter } = await import('/player/xr.js'),
+      rows = [];
+    await measure(element, (row) => rows.push(row), { before: 1, seconds: 3 });
+    const ended = enter(player);
+    for (let i = 0; i < 600 && rows.length < 2; i++) await new Promise((done) => setTimeout(done, 50));
+    await window.device.activeSession.end();
+    await ended;
+    return { rows, frames: player.figures.frames };
+  });
+  t.diagnostic(JSON.stringify(seen));
+  const cells = seen.rows.map((row) => row.split('|').slice(1, -1).map((cell) => cell.trim()));
+  assert.equal(cells.length, 2);
+  for (const [, , rung, drawn, fps] of cells) assert.ok(rung === 'whole' && +drawn.replace(',', '') > 1000 && +fps > 0 && +fps < 1000);
+  assert.match(cells[0][0], /^320×\d+, .*SwiftShader/);
+  assert.match(cells[1][0], /^headset, /);
+  assert.ok(seen.frames > 0);
+  assert.deepEqual(errors, []);
+});

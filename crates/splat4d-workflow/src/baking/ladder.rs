@@ -4,10 +4,12 @@ use super::likeness;
 use crate::deadline::Deadline;
 use crate::events::Listener;
 use crate::files::{grouped, human_bytes};
-use splat4d::format::playback::{Index, Kind, read_pages};
+use splat4d::format::playback::{Index, Kind, Rung, read_pages};
 use splat4d::layers::Scene;
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
+use splat4d_train::path_text::in_command;
+use std::path::Path;
 
 /// Bits of a megabit.
 pub(super) const MEGA: f64 = 1e6;
@@ -60,7 +62,7 @@ pub(crate) fn rungs(index: &Index) -> Vec<RungReport> {
     let span = pages.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |s, e| [s[0].min(e.span[0]), s[1].max(e.span[1])]);
     let seconds = (span[1] - span[0]).max(f64::MIN_POSITIVE);
     let before: u64 = pages.iter().map(|e| e.offset).min().unwrap_or(0);
-    let report = |rung: &splat4d::format::playback::Rung| {
+    let report = |rung: &Rung| {
         let own = || pages.iter().filter(|e| e.tier < rung.tiers);
         let at_once = own().map(|e| f64::from(e.count) * (e.span[1] - e.span[0])).sum::<f64>() / seconds;
         let first = own().filter(|e| e.tier == 0 && e.span[0] <= start && start < e.span[1]);
@@ -146,9 +148,33 @@ pub(super) fn notes(rungs: &[RungReport], given: &[f64]) -> Vec<String> {
     out
 }
 
+/// The command that gives a run of the scene of a file with these rungs a ladder again; none without rungs.
+pub(crate) fn again(rungs: &[Rung], run: &Path) -> Option<String> {
+    let rates: Vec<String> = rungs.iter().map(|rung| hundredths(rung.rate / MEGA)).collect();
+    let mut file = run.as_os_str().to_owned();
+    file.push("-ladder.s4d");
+    let [run, file] = [run, Path::new(&file)].map(in_command);
+    (!rates.is_empty()).then(|| format!("splat4d bake {run} -o {file} --ladder {}", rates.join(",")))
+}
+
+/// A rate with two decimals, rounded up, so that what fits into the rate fits into this.
+fn hundredths(rate: f64) -> String {
+    let rounded = (rate * 100.0).round();
+    let rounded = if rounded / 100.0 < rate * (1.0 - f64::EPSILON) { rounded + 1.0 } else { rounded };
+    (rounded / 100.0).to_string()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_command_for_another_ladder_has_rates_that_suffice() {
+        let rung = |rate: f64| Rung { rate, tiers: 1, ..Rung::default() };
+        assert_eq!(again(&[], Path::new("a")), None);
+        let command = again(&[rung(0.4e6), rung(4.1e6), rung(6.061e6)], Path::new("runs/my dance")).unwrap();
+        assert_eq!(command, "splat4d bake 'runs/my dance' -o 'runs/my dance-ladder.s4d' --ladder 0.4,4.1,6.07");
+    }
 
     #[test]
     fn rates_must_rise_from_above_zero() {
