@@ -248,11 +248,11 @@ pub fn seeds(
     };
     let have_depth = !seen.is_empty();
     out.append(seen);
-    if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
-        out.append(points.expect("just seen"));
-    }
+    let points = points.filter(|p| !p.is_empty() && !matches!(settings.source, Source::Random | Source::Hull));
+    let use_points = points.is_some();
+    out.append(points.unwrap_or_default());
     let sky = shell::before(plan, frames, &mut out)?;
-    if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
+    if use_points {
         let filled = matches!(settings.source, Source::Auto | Source::Pictures);
         if filled && !have_depth && out.len() < count {
             // Surfaces that move are elsewhere at other times.

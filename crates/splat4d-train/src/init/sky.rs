@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use splat4d::math::median;
 use splat4d::math::se3::{dot, norm, sub};
 use splat4d::scene::Camera;
-use view::{Cell, SAMPLES, View, cell, grid, occupied};
+use view::{Cell, SAMPLES, View, around, cell, grid, occupied};
 pub(super) use view::{FOREGROUND, views};
 
 /// Views that are examined at most, evenly chosen.
@@ -212,8 +212,14 @@ impl Sky {
         };
         let near = self.cells(|c| c == Cell::Near);
         let wrong: Vec<bool> = near.par_iter().map(wrong).collect();
+        let mut right: Vec<Vec<bool>> = self.views.iter().map(|v| vec![false; v.cells.len()]).collect();
+        near.iter().zip(&wrong).filter(|(_, wrong)| !**wrong).for_each(|((v, k), _)| right[*v][*k] = true);
         for ((v, k), _) in near.into_iter().zip(wrong).filter(|(_, wrong)| *wrong) {
-            self.views[v].cells[k] = Cell::Open;
+            let view = &mut self.views[v];
+            // Next to something near, the outline may be in the cell.
+            if !around(k, view.grid).any(|k| right[v][k]) {
+                view.cells[k] = Cell::Open;
+            }
         }
     }
 

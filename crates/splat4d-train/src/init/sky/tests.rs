@@ -13,7 +13,7 @@ const BALL: ([f64; 3], f64) = ([0.0, 0.5, 0.0], 0.8);
 pub(in crate::init) const FAR: f64 = 100.0;
 const NEAR: f64 = 2.0;
 
-/// Eight cameras on an arc of radius 4 before the ball.
+/// Cameras on an arc of radius 4 before the ball.
 pub(in crate::init) struct Film {
     cameras: Vec<Camera>,
     dome: f64,
@@ -21,8 +21,13 @@ pub(in crate::init) struct Film {
 
 impl Film {
     pub(in crate::init) fn new(dome: f64) -> Self {
+        Self::on_arc(0.9, dome)
+    }
+
+    /// `half`: half of the arc, radians.
+    fn on_arc(half: f64, dome: f64) -> Self {
         let camera = |i: usize| {
-            let a = 0.9 * (2.0 * i as f64 / (CAMERAS - 1) as f64 - 1.0);
+            let a = half * (2.0 * i as f64 / (CAMERAS - 1) as f64 - 1.0);
             let eye = [4.0 * a.sin(), [1.1, 1.9][i % 2], 4.0 * a.cos()];
             let pose = Se3::look_at(eye, [0.0, 0.7, -0.3], [0.0, 1.0, 0.0]);
             let mut camera = Camera::with_fov_y(pose, 0.8, SIZE[0], SIZE[1]);
@@ -167,4 +172,25 @@ fn cameras_at_one_place_measure_nothing() {
     let one = Film { cameras: vec![film.cameras[3].clone(); CAMERAS], dome: film.dome };
     let evidence = Sky::open(&one, &[], one.cameras[0].center(), 1.0).unwrap().fit();
     assert!(!evidence.is_far(), "{evidence:?}");
+}
+
+#[test]
+fn wrong_points_before_the_sky_are_cleared() {
+    // Several cameras have the same part of the sky in their images.
+    let film = Film::on_arc(0.25, FAR);
+    let camera = &film.cameras[4];
+    // As wrong matches are: near, and left and right of the ball, where cameras see sky.
+    let pixel = |k: u32| [if k < 15 { 20.0 } else { 80.0 } + 2.0 * f64::from(k), 12.5];
+    let wrong: Vec<[f64; 3]> = (0..30).map(|k| camera.unproject(pixel(k), 3.0 + 0.1 * f64::from(k))).collect();
+    let (center, extent) = film.center_and_extent();
+    let mut sky = Sky::open(&film, &[film.points(), wrong.clone()].concat(), center, extent).unwrap();
+    let is_near = |c: Cell| c == Cell::Near;
+    let before = sky.cells(is_near).len();
+    sky.mark(400.0);
+    let ([after, alone], hidden) =
+        ([&sky, &film.sky()].map(|s| s.cells(is_near).len()), wrong.iter().filter(|x| sky.hides(**x)).count());
+    assert!(hidden >= 20, "{hidden} of 30; {before} cells with near points became {after}, of the ball alone {alone}");
+    assert!(after < (before + alone) / 2, "{before} cells with near points became {after}, of the ball alone {alone}");
+    let lost = film.points().iter().filter(|&&x| sky.hides(x)).count();
+    assert_eq!(lost, 0, "points of the ball");
 }

@@ -99,14 +99,18 @@ pub(super) fn grid(camera: &Camera) -> [usize; 2] {
     [camera.width, camera.height].map(|n| (n as f64 / side).round().max(1.0) as usize)
 }
 
+/// A cell and those that touch it.
+pub(super) fn around(cell: usize, grid: [usize; 2]) -> impl Iterator<Item = usize> {
+    let along = |at: usize, n: usize| at.saturating_sub(1)..=(at + 1).min(n - 1);
+    let columns = along(cell % grid[0], grid[0]);
+    along(cell / grid[0], grid[1]).flat_map(move |y| columns.clone().map(move |x| y * grid[0] + x))
+}
+
 /// Whether each cell of a camera's image has a near point in it or next to it.
 pub(super) fn occupied(camera: &Camera, grid: [usize; 2], near: &[[f64; 3]]) -> Vec<bool> {
     let mut out = vec![false; grid[0] * grid[1]];
     for k in near.iter().filter_map(|&x| cell(camera, grid, camera.project(x)?.0)) {
-        let around = |at: usize, n: usize| at.saturating_sub(1)..=(at + 1).min(n - 1);
-        for y in around(k / grid[0], grid[1]) {
-            around(k % grid[0], grid[0]).for_each(|x| out[y * grid[0] + x] = true);
-        }
+        around(k, grid).for_each(|k| out[k] = true);
     }
     out
 }
