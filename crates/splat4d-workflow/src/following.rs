@@ -14,8 +14,9 @@ use crate::sound;
 use crate::source::Source;
 use crate::training::{Finish, Trained, TrainingOptions};
 use serde_json::json;
-use splat4d::format::playback::{self, Draft, Meta, WriteConfig};
+use splat4d::format::playback::{self, Draft, Growing, Meta, Sound, WriteConfig};
 use splat4d::format::scene;
+use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::event::{Event, FollowedFrame};
 use splat4d_train::output::OutputFolder;
@@ -23,6 +24,7 @@ use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::follow::{Arrival, Following, Segment};
 use std::cell::Cell;
+use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -33,7 +35,7 @@ const POLL: Duration = Duration::from_millis(100);
 const SAVING: &str = "stopping: finished frames are kept";
 /// Frames after a missing one among which the next complete one is searched for.
 const GAP: usize = 30;
-/// Entries of the palette of a part, rounds that fit it and effort of deflate: a part is written while frames wait.
+/// Entries of the palette of a part, rounds that fit it and effort of deflate while frames wait.
 const PALETTE: usize = 1024;
 /// See [`PALETTE`].
 const ROUNDS: usize = 2;
@@ -176,8 +178,7 @@ impl Live<'_> {
         if interrupted {
             return Ok(true);
         }
-        self.complete()?;
-        Ok(false)
+        self.complete()
     }
 
     /// Waits for the next frame, and leaves out frames that never come.
@@ -250,12 +251,11 @@ impl Live<'_> {
         let run = Run::open(self.run)?;
         let views = run.views()?;
         let first = self.recipe.capture.first_frame;
-        let Segment { shell, sh_degree, nodes } = self.following.segment(first..first + 1);
+        let (_, Segment { shell, sh_degree, nodes }) = self.following.part(first, false).expect("a frame is done");
         let outline = Outline { clip: shell.clip, sh_degree, bounds: bounds(&nodes) };
         let stage = Source::own(shell.clone()).stage(&views);
         let about = Meta { title: name, ..meta(&shell, &outline, &stage, &distinct(&views)) };
         let film = Film::open(&self.run.join(FILE), about, self.following.next())?;
-        self.following.forget(film.frames(first));
         self.film = Some(film);
         Ok(())
     }
@@ -275,23 +275,13 @@ impl Live<'_> {
 
     /// Appends the frames that are not in the playback file yet: as many as make a part, or all.
     fn grow(&mut self, all: bool) -> Result<()> {
-        let (first, done) = (self.recipe.capture.first_frame, self.following.next());
+        let first = self.recipe.capture.first_frame;
         let film = self.film.as_mut().expect("it is opened with the first frame");
         let mut grown = false;
-        loop {
-            let from = film.frames(first);
-            // The first frame alone, so that there is something to play.
-            let length = if from == first { 1 } else { self.recipe.follow.segment };
-            // How Gaussians leave a frame is known with the next one.
-            let known = if all || from == first { done } else { done - 1 };
-            if from >= known || !all && known - from < length {
-                break;
-            }
-            let to = known.min(from + length);
-            let Segment { shell, sh_degree, nodes } = self.following.segment(from..to);
-            let (clip, bounds) = (shell.clip, union(film.about.bounds, bounds(&nodes)));
-            let bytes = part(&film.about, nodes, clip, sh_degree)?;
-            film.append(&bytes, from..to, Meta { clip, sh_degree, bounds, ..film.about.clone() })?;
+        while let Some((frames, segment)) = self.following.part(film.frames(first), all) {
+            let (from, to) = (frames.start, frames.end);
+            let (bytes, meta) = part(&film.about, segment, &quick())?;
+            film.append(&bytes, frames, meta)?;
             let each = (bytes.len() as u64).div_ceil((to - from) as u64);
             self.rows
                 .iter_mut()
@@ -306,7 +296,6 @@ impl Live<'_> {
                 to - 1,
                 human_bytes(bytes.len() as u64)
             ));
-            self.following.forget(to);
             grown = true;
         }
         self.write_table()?;
@@ -323,7 +312,7 @@ impl Live<'_> {
             return Ok(());
         }
         let film = self.film.as_ref().expect("it was appended to");
-        let bytes = film.finished((None, None))?;
+        let bytes = film.finished()?;
         let held_out = self.rows.last().and_then(|(frame, _)| frame.psnr);
         let iteration = self.following.next() - self.recipe.capture.first_frame;
         self.listener.event(&Event::Snapshot { iteration, bytes: bytes.into(), held_out });
@@ -349,19 +338,43 @@ impl Live<'_> {
         files::write(&path, text.as_bytes())
     }
 
-    /// The run's scene, and its playback file as a finished one.
-    fn complete(self) -> Result<()> {
+    /// The run's scene, and its playback file as a finished one. Returns whether a stop was requested before.
+    fn complete(self) -> Result<bool> {
         let film = self.film.as_ref().expect("a frame is done");
         let run = Run::open(self.run)?;
-        let bytes = film.finished((None, None))?;
-        let scene = playback::read(&bytes)?;
+        let (first, end) = (self.recipe.capture.first_frame, self.following.next());
+        // There is time now for palettes that fit.
+        let mut store = Cursor::new(Vec::new());
+        let mut about = film.about.clone();
+        let mut whole = Growing::begin(&mut store, Meta { clip: [about.clip[0]; 2], gaussians: 0, ..about.clone() })?;
+        let written = self.following.again(&mut |frames, segment| {
+            if self.stop.load(Ordering::Relaxed) {
+                return Err(Error::new(ErrorKind::Interrupted, "stopped"));
+            }
+            self.listener.phase("the playback file, frame", frames.start - first, end - first);
+            let (bytes, meta) = part(&about, segment, &WriteConfig::default())?;
+            about.bounds = meta.bounds;
+            whole.append(&bytes, meta, &mut |_| Ok(()))
+        });
+        self.listener.clear();
+        match written {
+            Err(e) if e.kind() == ErrorKind::Interrupted => return Ok(true),
+            written => written?,
+        }
+        let meta = whole.index().meta.clone();
+        let mut packed = |sections: (Option<&[u8]>, Option<&Sound>)| -> Result<Vec<u8>> {
+            let mut bytes = Vec::new();
+            playback::finish(&mut store, meta.clone(), sections, &mut bytes)?;
+            Ok(bytes)
+        };
+        let scene = playback::read(&packed((None, None))?)?;
         let stage = Source::own(scene.clone()).stage(&run.views()?);
         let poster = poster(&scene, &stage, false);
         let sound = sound::of_run(&run).unwrap_or_else(|e| {
             self.listener.warn(&format!("the sound is left out: {e}"));
             None
         });
-        let bytes = film.finished((poster.as_deref(), sound.as_ref()))?;
+        let bytes = packed((poster.as_deref(), sound.as_ref()))?;
         let mut own = Vec::new();
         scene::write(&scene, &mut own)?;
         self.following.write_info(self.options.clock.seconds(), true)?;
@@ -370,18 +383,23 @@ impl Live<'_> {
         files::write(&self.run.join(FILE), &bytes)?;
         self.listener.written(&self.run.join(FILE));
         self.listener.result(&format!("the playback file has {}", human_bytes(bytes.len() as u64)));
-        Ok(())
+        Ok(false)
     }
 }
 
-/// Frames as a playback file of their own.
-fn part(about: &Meta, nodes: Vec<playback::Node>, clip: [f64; 2], sh_degree: usize) -> Result<Vec<u8>> {
+/// How a part is written while frames wait.
+fn quick() -> WriteConfig {
+    WriteConfig { palette: PALETTE, kmeans_rounds: ROUNDS, deflate_level: EFFORT, ..WriteConfig::default() }
+}
+
+/// Frames as a playback file of their own, and the metadata of the whole with them.
+fn part(about: &Meta, segment: Segment, config: &WriteConfig) -> Result<(Vec<u8>, Meta)> {
+    let Segment { shell: Scene { clip, .. }, sh_degree, nodes } = segment;
+    let bounds = union(about.bounds, bounds(&nodes));
     let meta = Meta { clip, sh_degree, ..about.clone() };
-    let config =
-        WriteConfig { palette: PALETTE, kmeans_rounds: ROUNDS, deflate_level: EFFORT, ..WriteConfig::default() };
     let mut bytes = Vec::new();
-    playback::write(&Draft { meta, nodes, poster: None }, &config, &mut bytes)?;
-    Ok(bytes)
+    playback::write(&Draft { meta: meta.clone(), nodes, poster: None }, config, &mut bytes)?;
+    Ok((bytes, Meta { bounds, ..meta }))
 }
 
 /// Least and greatest corner of the means.

@@ -9,7 +9,7 @@ use crate::playable::FILE;
 use crate::run_folder::Run;
 use crate::sound;
 use crate::source::Source;
-use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, Sound, finish};
+use splat4d::format::playback::{Growing, HEADER_BYTES, Index, Meta, finish};
 use splat4d::layers::Scene;
 use splat4d::{Error, Result};
 use splat4d_train::output::{note, write_atomically_with};
@@ -254,11 +254,11 @@ impl Film {
     }
 
     /// Its present content as a finished file.
-    pub(crate) fn finished(&self, (poster, sound): (Option<&[u8]>, Option<&Sound>)) -> Result<Vec<u8>> {
+    pub(crate) fn finished(&self) -> Result<Vec<u8>> {
         let mut source = files::open(&self.path)?;
         let mut bytes = Vec::new();
         let meta = self.file.index().meta.clone();
-        finish(&mut source, meta, (poster, sound), &mut bytes).map_err(|e| e.at(self.path.display()))?;
+        finish(&mut source, meta, (None, None), &mut bytes).map_err(|e| e.at(self.path.display()))?;
         Ok(bytes)
     }
 }

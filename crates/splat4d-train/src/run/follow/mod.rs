@@ -111,23 +111,28 @@ impl Following {
             }
             write_atomically(&file, format!("{plan:#}\n").as_bytes())?;
         }
-        let mut following = Self {
-            run: run.to_owned(),
-            options: capture_options(recipe)?,
+        let mut following = Self::before(root, recipe.clone(), run.to_owned(), device)?;
+        for frame in record::list(&following.folder()) {
+            following.replay(frame)?;
+        }
+        Ok(following)
+    }
+
+    /// Before the first frame.
+    fn before(root: PathBuf, recipe: Recipe, run: PathBuf, device: Device) -> Result<Self> {
+        Ok(Self {
+            run,
+            options: capture_options(&recipe)?,
             root,
-            recipe: recipe.clone(),
             device,
             watch: arrival::Watch::default(),
             lenses: Lenses::default(),
             rig: None,
             facts: Value::Null,
             next: recipe.capture.first_frame,
+            recipe,
             state: None,
-        };
-        for frame in record::list(&following.folder()) {
-            following.replay(frame)?;
-        }
-        Ok(following)
+        })
     }
 
     /// Whether a folder is the run of a followed capture.
@@ -354,26 +359,54 @@ impl Following {
         frame as f64 / fps
     }
 
-    /// Some frames, as a part of a playback file. Frames that were [forgotten](Self::forget) are incomplete.
+    /// The part of a playback file that begins with the frame `from`, if its frames are done; `all`: those that are done.
+    /// Frames before it are in the file and leave the memory.
     ///
     /// Panics: no frame is done.
-    pub fn segment(&self, frames: Range<usize>) -> Segment {
+    pub fn part(&mut self, from: usize, all: bool) -> Option<(Range<usize>, Segment)> {
+        if let Some(state) = &mut self.state {
+            state.history.forget(from);
+        }
+        // The first frame alone, so that there is something to play.
+        let begins = from == self.first();
+        let length = if begins { 1 } else { self.recipe.follow.segment };
+        // How Gaussians leave a frame is known with the next one.
+        let known = if all || begins { self.next } else { self.next - 1 };
+        if from >= known || !all && known - from < length {
+            return None;
+        }
+        let frames = from..known.min(from + length);
         let state = self.state.as_ref().expect("a frame is done");
         let clip = [self.seconds(self.first()), self.seconds(frames.end.saturating_sub(1))];
         let sh_degree = splat4d::math::sh::degree_of(state.history.coefficients()).unwrap_or(0);
-        Segment { shell: Scene { clip, ..state.shell.clone() }, sh_degree, nodes: self.nodes(frames) }
+        let shell = Scene { clip, ..state.shell.clone() };
+        let nodes = self.nodes(frames.clone());
+        Some((frames, Segment { shell, sh_degree, nodes }))
+    }
+
+    /// All parts again, from the files of the frames, one after the other. Errors: those of `each`; a file is damaged.
+    pub fn again(&self, each: &mut dyn FnMut(Range<usize>, Segment) -> Result<()>) -> Result<()> {
+        let (run, recipe) = (self.run.clone(), self.recipe.clone());
+        let mut past = Self::before(self.root.clone(), recipe, run, self.device)?;
+        let mut from = past.first();
+        let frames = record::list(&self.folder());
+        for (k, &frame) in frames.iter().enumerate() {
+            past.replay(frame)?;
+            let all = k + 1 == frames.len();
+            if all {
+                past.next = self.next;
+            }
+            while let Some((part, segment)) = past.part(from, all) {
+                from = part.end;
+                each(part, segment)?;
+            }
+        }
+        Ok(())
     }
 
     /// Some frames as nodes.
     fn nodes(&self, frames: Range<usize>) -> Vec<Node> {
         self.state.as_ref().map_or_else(Vec::new, |s| s.history.nodes(frames, &|f| self.seconds(f)))
-    }
-
-    /// Frees the memory of frames before `frame`, which are in a file.
-    pub fn forget(&mut self, frame: usize) {
-        if let Some(state) = &mut self.state {
-            state.history.forget(frame);
-        }
     }
 
     /// The capture's first frame: its cameras. Errors: its images are no longer there.
