@@ -28,7 +28,7 @@ pub use spacing::Gap;
 
 use crate::board::Board;
 use crate::calibration::Video;
-use crate::clicks::Clicks;
+use crate::clicks::{Clicks, Found};
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
 use crate::sync::graph::{self, Evidence};
@@ -87,6 +87,8 @@ pub struct Request {
     pub synchronous: bool,
     /// Points that the user clicked (`Desk`), which give poses, focal lengths and time offsets.
     pub points: Option<PathBuf>,
+    /// A folder with keypoints of people in all frames, which give the same without clicks.
+    pub keypoints: Option<PathBuf>,
 }
 
 /// Pixels of the shorter side that images get: training on a CPU resolves no more.
@@ -115,6 +117,7 @@ impl Request {
             masks: None,
             synchronous: false,
             points: None,
+            keypoints: None,
         }
     }
 }
@@ -136,7 +139,8 @@ const CONTRADICTS: f64 = 5.0;
 /// A calibration that more than this part of the judged cameras contradict belongs to another recording.
 const CONTRADICTED: f64 = 0.67;
 /// The remedy where images of fixed cameras have too few matches.
-const BY_HAND: &str = "or click a few points in all cameras (--assist, docs/assist.md); or ";
+const BY_HAND: &str =
+    "or click a few points in all cameras (--assist, docs/assist.md), or give keypoints of people (--keypoints); or ";
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -163,8 +167,12 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
+    let (clicks, found_by) = match &request.keypoints {
+        Some(folder) => (Some(assist::detected(folder, &cameras, &pictures, &known, &clock, &kept)?), Found::Detected),
+        None => (clicks, Found::Clicked),
+    };
     if let Some(clicks) = &clicks {
-        let placed = assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?;
+        let placed = assist::placed((clicks, found_by), &pictures, &mut known, &clock, &kept, &mut report)?;
         told.iter_mut().zip(&placed.offsets).for_each(|(t, o)| *t = o.or(*t));
         clock = clocks::solve(&cameras, &heard, &told);
         clicked = Some(placed.origin);
