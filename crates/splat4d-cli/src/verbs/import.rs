@@ -94,7 +94,7 @@ pub(crate) struct Args {
     /// Use the clicked points of this file, without a page; with --assist, start the page from it
     #[arg(long, value_name = "FILE", conflicts_with = "colmap")]
     points: Option<PathBuf>,
-    /// Experimental: calibrate the cameras by keypoints of people, a folder with NAME/ or NAME.json of each camera
+    /// Calibrate the cameras by keypoints of people in every frame: a folder with NAME/ or NAME.json of each camera
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["colmap", "points", "assist"])]
     keypoints: Option<PathBuf>,
     /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
@@ -228,12 +228,6 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         request.points = Some(clicked(&request, &place, &stop, console)?);
     }
     let imported = import(&request, !args.no_doctor, &stop, console)?;
-    if args.keypoints.is_some() {
-        console.warn(
-            "poses from keypoints are experimental: with two people in the images, one camera of a real rig was 41 degrees \
-             off without an error. Compare with --assist or a calibration (docs/assist.md)",
-        );
-    }
     if console.json() {
         console.emit(&imported.json());
     } else {

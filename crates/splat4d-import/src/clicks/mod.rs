@@ -2,14 +2,14 @@
 //!
 //! Cameras at right angles share no features, but a person recognises the same corner in all of them. Six to eight such
 //! points are enough for the poses of a rig (`solve.rs`); an event that all cameras show synchronises them. Without
-//! clicks, keypoints of people in all cameras (`keypoints.rs`) are such points (`people.rs`).
+//! clicks, keypoints of people in all cameras (`keypoints.rs`) calibrate and synchronise them (`people/`).
 
 mod keypoints;
 mod people;
 mod solve;
 
-pub(crate) use keypoints::read_keypoints;
-pub(crate) use people::{Named, People};
+pub(crate) use keypoints::{Frames, read_keypoints};
+pub(crate) use people::{Calibrated, calibrate};
 pub(crate) use solve::{Camera, Point, Sight, Solution, plane, solve};
 
 use crate::{Error, ErrorKind, Result};
@@ -24,28 +24,6 @@ const VERSION: u32 = 1;
 const LARGEST: u64 = 8 << 20;
 /// Points of a floor, at least: three span a plane.
 pub(crate) const FLOOR: usize = 3;
-
-/// How points were found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Found {
-    /// By a user, who clicked them.
-    Clicked,
-    /// By a detector of people.
-    Detected,
-}
-
-impl Found {
-    /// Error of one, pixels of an image 1920 across: a finger or a mouse on an enlarged image; a detector's joint, which
-    /// is inside of the body and elsewhere from every side.
-    pub(crate) fn noise(self) -> f64 {
-        if self == Self::Clicked { 1.5 } else { 6.0 }
-    }
-
-    /// Their name.
-    pub(crate) fn words(self) -> &'static str {
-        if self == Self::Clicked { "clicked points" } else { "keypoints of people" }
-    }
-}
 
 /// The file: what was clicked, in pixels of images of a stated size and seconds of the cameras' own clocks.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -141,18 +119,6 @@ impl Clicks {
 
     pub(crate) fn json(&self) -> String {
         serde_json::to_string_pretty(self).expect("clicks are plain data") + "\n"
-    }
-
-    /// Keypoints of people in the images of cameras with these names and sizes.
-    pub(crate) fn of_people(names: &[&str], sizes: &[[usize; 2]], named: &[Named]) -> Self {
-        let click = |s: &Sight| Click { camera: names[s.camera].into(), x: s.pixel[0], y: s.pixel[1], time: s.time };
-        let point = |n: &Named| ClickedPoint {
-            name: format!("person {}, keypoint {}", n.person + 1, n.keypoint),
-            moment: Some(n.moment),
-            clicks: n.sights.iter().map(click).collect(),
-        };
-        let cameras = names.iter().zip(sizes).map(|(name, size)| ((*name).to_owned(), *size)).collect();
-        Self { points: named.iter().map(point).collect(), ..Self::none(cameras) }
     }
 
     /// None yet, in images of these sizes.

@@ -13,6 +13,8 @@ use splat4d::math::se3::{add, dot, mat_vec, norm, normalize, scale, sub, transpo
 use splat4d::math::sym3::eigen;
 use splat4d::math::{Rng, Se3, mat3, median};
 
+/// Error of a click, pixels of an image 1920 across: a finger or a mouse on an enlarged image.
+const NOISE: f64 = 1.5;
 /// Clicks farther from their points than this many times the error hardly count (Cauchy's loss): a wrong corner must not
 /// bend the rig.
 const SCALE: f64 = 3.0;
@@ -74,8 +76,6 @@ pub(crate) struct Camera {
     pub offset: Option<f64>,
     /// Whether the offset is exact and stays.
     pub keep_offset: bool,
-    /// Error of a point in its images, pixels of an image 1920 across.
-    pub noise: f64,
 }
 
 /// A click.
@@ -175,7 +175,7 @@ pub(crate) fn solve(cameras: &[Camera], points: &[Point]) -> Solution {
 
 /// Pixels of a camera for one unit: the error of a click.
 fn error_of(camera: &Camera) -> f64 {
-    camera.noise * unit(larger(camera))
+    NOISE * unit(larger(camera))
 }
 
 fn larger(camera: &Camera) -> f64 {

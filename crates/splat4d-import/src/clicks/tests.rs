@@ -7,19 +7,19 @@ use splat4d::math::se3::mat_mul;
 use splat4d::math::{Rng, Se3};
 
 /// Seconds between frames.
-pub(in crate::clicks) const FRAME: f64 = 1.0 / 30.0;
+const FRAME: f64 = 1.0 / 30.0;
 
 /// Four cameras at right angles, about four metres from what they show.
-pub(in crate::clicks) struct Studio {
-    pub poses: Vec<Se3>,
-    pub lenses: Vec<Lens>,
-    pub cameras: Vec<Camera>,
+struct Studio {
+    poses: Vec<Se3>,
+    lenses: Vec<Lens>,
+    cameras: Vec<Camera>,
     /// Seconds that are added to each clock.
-    pub offsets: Vec<f64>,
+    offsets: Vec<f64>,
 }
 
 impl Studio {
-    pub(in crate::clicks) fn new(seed: u64) -> Self {
+    fn new(seed: u64) -> Self {
         let rng = Rng::new(seed, "studio", 0);
         let pose = |c: usize| {
             let angle = std::f64::consts::FRAC_PI_2 * c as f64 + 0.1 * rng.normal(c as u64);
@@ -33,14 +33,7 @@ impl Studio {
             }
         };
         let size = [1920, 1080];
-        let camera = Camera {
-            size,
-            focal: None,
-            interval: FRAME,
-            offset: None,
-            keep_offset: false,
-            noise: Found::Clicked.noise(),
-        };
+        let camera = Camera { size, focal: None, interval: FRAME, offset: None, keep_offset: false };
         Self {
             poses: (0..4).map(pose).collect(),
             lenses: (0..4).map(|c| Lens::plain(1400.0 * (1.0 + 0.003 * rng.normal(40 + c)), 1920, 1080)).collect(),
@@ -83,7 +76,7 @@ impl Studio {
     }
 
     /// The largest errors: degrees, share of the rig's radius.
-    pub(in crate::clicks) fn error(&self, found: &Solution) -> [f64; 2] {
+    fn error(&self, found: &Solution) -> [f64; 2] {
         let poses: Vec<Se3> = found.cameras.iter().map(|c| c.as_ref().expect("all have a pose").0).collect();
         let all = apart(&poses, &self.poses).expect("cameras are apart");
         [all.iter().map(|a| a.degrees).fold(0.0, f64::max), all.iter().map(|a| a.center).fold(0.0, f64::max)]

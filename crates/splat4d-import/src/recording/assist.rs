@@ -4,7 +4,7 @@ use super::given;
 use super::report::Report;
 use super::world::Origin;
 use super::{Material, Request, material};
-use crate::clicks::{self, Clicks, Found, People, Solution, plane, read_keypoints};
+use crate::clicks::{self, Clicks, Solution, plane};
 use crate::sfm::known::Straight;
 use crate::sfm::lens::Known;
 use crate::sync::graph;
@@ -25,9 +25,9 @@ use std::sync::{Mutex, PoisonError};
 const FILE: &str = "import/points.json";
 /// Those that were there before others were given.
 const OLD: &str = "import/points.old.json";
-/// Median distance of clicks from their points above which a rig is refused, of the larger side and of their error: 10 px
-/// of 1920 for clicks. Errors of clicks are a fifth of it, wrong corners ten times as large.
-const MOST_ERROR: f64 = 0.005 / 1.5;
+/// Median distance of clicks from their points above which a rig is refused, of the larger side: 10 px of 1920. Errors
+/// of clicks are a fifth of it, wrong corners ten times as large.
+const MOST_ERROR: f64 = 0.005;
 /// Widths and heights of images whose quotients differ by more are parts of different images.
 const SHAPE: f64 = 0.01;
 /// Positions along the ray of a click at which its epipolar line is computed, and the nearest, of the rig's unit.
@@ -65,52 +65,6 @@ pub(super) fn read(file: &Path, request: &Request, names: &[String], here: &[&st
     Ok(clicks)
 }
 
-/// Keypoints of people in a folder, as points that cameras share.
-///
-/// Errors: those of reading; a camera without people; people that give no rig.
-pub(super) fn detected(
-    folder: &Path,
-    cameras: &[super::Camera],
-    pictures: &[Pictures],
-    known: &[Option<Known>],
-    clock: &graph::Solution,
-    kept: &[bool],
-) -> Result<Clicks> {
-    let names: Vec<&str> = pictures.iter().map(|p| p.name.as_str()).collect();
-    let place = |e: Error| e.at(folder.display());
-    let frames = read_keypoints(folder, &names)?;
-    let people = People::new(&frames);
-    if let Some(c) = people.missing().next() {
-        return Err(place(
-            Error::input(format!("the keypoints contain no person in the images of camera {}", names[c]))
-                .remedy("Leave the camera out (use = false in import.toml), or align it by hand (--assist)."),
-        ));
-    }
-    // In pixels of the videos, in which people were detected.
-    let sizes: Vec<[usize; 2]> = cameras.iter().map(|c| c.source.info().size).collect();
-    let camera = |c: usize| {
-        let info = cameras[c].source.info();
-        let rate = info.average_rate.or(info.nominal_rate).filter(|rate| *rate > 0.0);
-        let by = sizes[c][0] as f64 / pictures[c].size[0].max(1) as f64;
-        clicks::Camera {
-            size: sizes[c],
-            focal: known[c].map(|k| by * k.straight(pictures[c].size, 1.0).focal()),
-            interval: rate.map_or(pictures[c].clock.interval, |rate| 1.0 / rate),
-            offset: clock.offsets[c].as_ref().map(|o| o.seconds),
-            keep_offset: kept[c],
-            noise: Found::Detected.noise(),
-        }
-    };
-    let cameras: Vec<clicks::Camera> = (0..names.len()).map(camera).collect();
-    let who = people.identities(&cameras).ok_or_else(|| {
-        place(
-            Error::input("no choice of people in the images gives poses to the cameras")
-                .remedy("Give keypoints of frames in which all cameras show the same person, or use --assist."),
-        )
-    })?;
-    Ok(Clicks::of_people(&names, &sizes, &people.all(&cameras, &who)))
-}
-
 /// Given values of cameras by their clicked points.
 pub(super) struct Placed {
     /// Offsets by an event or by moving points.
@@ -123,7 +77,7 @@ pub(super) struct Placed {
 /// Errors: clicks in images of another shape; cameras without a pose; clicks that contradict each other; calibrated
 /// positions.
 pub(super) fn placed(
-    (clicks, found_by): (&Clicks, Found),
+    clicks: &Clicks,
     pictures: &[Pictures],
     known: &mut [Option<Known>],
     clock: &graph::Solution,
@@ -131,11 +85,11 @@ pub(super) fn placed(
     report: &mut Report,
 ) -> Result<Placed> {
     if known.iter().flatten().any(|k| k.pose.is_some()) {
-        return Err(Error::input(format!("poses are given in two ways: by a calibration and by {}", found_by.words()))
-            .remedy("Leave --points, --keypoints or --calibration out, or give a calibration of lenses alone."));
+        return Err(Error::input("poses are given in two ways: by a calibration and by clicked points")
+            .remedy("Leave --points or --calibration out, or give a calibration of lenses alone."));
     }
-    let rig = Rig::new((clicks, found_by), pictures, known, clock, kept)?;
-    let (found, points) = (rig.solve(), found_by.words());
+    let rig = Rig::new(clicks, pictures, known, clock, kept)?;
+    let found = rig.solve();
     let missing: Vec<String> = found
         .cameras
         .iter()
@@ -143,23 +97,24 @@ pub(super) fn placed(
         .filter_map(|(c, p)| c.as_ref().err().map(|why| format!("{}: {why}", p.name)))
         .collect();
     if !missing.is_empty() {
-        return Err(Error::input(format!("the {points} give no pose to {}", missing.join("; ")))
+        return Err(Error::input(format!("the clicked points give no pose to {}", missing.join("; ")))
             .remedy("Click more points with --assist, or leave these cameras out (use = false in import.toml)."));
     }
     let (error, side) = (found.error.unwrap_or(0.0), rig.side());
-    if error > MOST_ERROR * found_by.noise() * side {
+    if error > MOST_ERROR * side {
         let (name, off) = rig.worst(&found);
         return Err(Error::input(format!(
-            "the {points} contradict each other: half of them are more than {error:.0} px from where they meet, \
+            "the clicked points contradict each other: half of the clicks are more than {error:.0} px from their points, \
              {name} is {off:.0} px off"
         ))
         .remedy("Correct the points with the largest distances in the page of --assist."));
     }
     if found.ambiguous {
-        report.guesses.push(format!(
-            "Another arrangement of the cameras fits the {points} about as well: check the result, or click more \
-             points at different depths (--assist)."
-        ));
+        report.guesses.push(
+            "Another arrangement of the cameras fits the clicked points about as well: check the result, or click more \
+             points at different depths."
+                .into(),
+        );
     }
     let by = rig.metres(&found);
     for (c, own) in known.iter_mut().enumerate() {
@@ -172,7 +127,7 @@ pub(super) fn placed(
     }
     let count: usize = clicks.points.iter().map(|p| p.clicks.len()).sum();
     report.guesses.push(format!(
-        "Poses and focal lengths are those of {} {points}: {count} positions in images, {error:.1} px off at the median.",
+        "Poses and focal lengths are those of {} clicked points: {count} clicks, {error:.1} px off at the median.",
         clicks.points.len()
     ));
     if by.is_some() {
@@ -196,7 +151,7 @@ struct Rig<'a> {
 
 impl<'a> Rig<'a> {
     fn new(
-        (clicks, found_by): (&'a Clicks, Found),
+        clicks: &'a Clicks,
         pictures: &'a [Pictures],
         known: &[Option<Known>],
         clock: &graph::Solution,
@@ -230,7 +185,6 @@ impl<'a> Rig<'a> {
                 interval: pictures[c].clock.interval,
                 offset: marked[c].or(before(c)),
                 keep_offset: kept[c],
-                noise: found_by.noise(),
             })
             .collect();
         let moving: Vec<&str> = clicks.points.iter().filter(|p| p.moment.is_some()).map(|p| p.name.as_str()).collect();
@@ -483,16 +437,9 @@ impl Desk {
         let finish = asked["finish"] == true;
         if finish {
             let mut known = self.known.clone();
-            placed(
-                (&clicks, Found::Clicked),
-                &self.pictures,
-                &mut known,
-                &self.clock,
-                &self.kept,
-                &mut Report::default(),
-            )?;
+            placed(&clicks, &self.pictures, &mut known, &self.clock, &self.kept, &mut Report::default())?;
         }
-        let rig = Rig::new((&clicks, Found::Clicked), &self.pictures, &self.known, &self.clock, &self.kept)?;
+        let rig = Rig::new(&clicks, &self.pictures, &self.known, &self.clock, &self.kept)?;
         write_atomically(&file, clicks.json().as_bytes())?;
         *revision += 1;
         let now = *revision;

@@ -12,6 +12,7 @@ mod fixed;
 mod geometry;
 mod given;
 mod inputs;
+mod people;
 mod poses;
 mod report;
 mod soundtrack;
@@ -28,7 +29,7 @@ pub use spacing::Gap;
 
 use crate::board::Board;
 use crate::calibration::Video;
-use crate::clicks::{Clicks, Found};
+use crate::clicks::Clicks;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
 use crate::sync::graph::{self, Evidence};
@@ -167,12 +168,14 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
-    let (clicks, found_by) = match &request.keypoints {
-        Some(folder) => (Some(assist::detected(folder, &cameras, &pictures, &known, &clock, &kept)?), Found::Detected),
-        None => (clicks, Found::Clicked),
+    let placed = match (&request.keypoints, &clicks) {
+        (Some(folder), _) => {
+            Some(people::placed(folder, &cameras, &pictures, &mut known, &clock, &kept, &mut report)?)
+        }
+        (None, Some(clicks)) => Some(assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?),
+        (None, None) => None,
     };
-    if let Some(clicks) = &clicks {
-        let placed = assist::placed((clicks, found_by), &pictures, &mut known, &clock, &kept, &mut report)?;
+    if let Some(placed) = placed {
         told.iter_mut().zip(&placed.offsets).for_each(|(t, o)| *t = o.or(*t));
         clock = clocks::solve(&cameras, &heard, &told);
         clicked = Some(placed.origin);
