@@ -133,11 +133,11 @@ impl Cameras<'_> {
             ))
             .remedy(format!("Give keypoints of a longer time, in which people walk through the whole space, {BY_HAND}.")));
         }
-        let distance = |s: &Spot| {
-            let x = s.place?;
-            Some(s.seen.iter().map(move |(c, _)| rig.poses[*c].expect("all are placed").apply(x)[2]))
-        };
-        let mut depths: Vec<f64> = spots.iter().filter_map(distance).flatten().collect();
+        let mut depths = Vec::new();
+        for spot in spots {
+            let Some(x) = spot.place else { continue };
+            depths.extend(spot.seen.iter().map(|(c, _)| rig.poses[*c].expect("all are placed").apply(x)[2]));
+        }
         let by = 1.0 / median(&mut depths).filter(|d| *d > 0.0).unwrap_or(1.0);
         let camera = |c: usize| {
             let pose = rig.poses[c].expect("all are placed");

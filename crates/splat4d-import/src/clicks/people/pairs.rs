@@ -142,10 +142,12 @@ fn best(pairs: &[Pair], lenses: [&Lens; 2], rng: Rng) -> Option<(f64, Se3)> {
     let (mut least, mut e) = found?;
     // Least squares of those that fit.
     let near: Vec<Pair> = rays.iter().filter(|r| sampson(&e, r) * square < 1.0).copied().collect();
-    let polished = essential_of(&polish_motion(&motions(&e)[0], &near));
-    let after = loss(&polished);
-    if near.len() > 5 && after < least {
-        (least, e) = (after, polished);
+    if near.len() > 5 {
+        let polished = essential_of(&polish_motion(&motions(&e)[0], &near));
+        let after = loss(&polished);
+        if after < least {
+            (least, e) = (after, polished);
+        }
     }
     // Of the four motions of the matrix that of most points before both cameras.
     let before = |m: &Se3| rays.iter().filter(|r| depths(m, r).iter().all(|z| *z > 0.0)).count();

@@ -99,61 +99,62 @@ fn a_walker_calibrates_and_synchronises_cameras_at_right_angles() {
     }
 }
 
-/// Measurement on the demo, not committed.
 #[test]
-#[ignore]
-fn demo() {
-    let folder = std::path::PathBuf::from(std::env::var("KP").unwrap());
-    let names = ["cam01", "cam02", "cam03", "cam04"];
-    let shift: Vec<usize> =
-        std::env::var("SHIFT").unwrap_or("0,0,0,0".into()).split(',').map(|s| s.parse().unwrap()).collect();
-    let frames = super::super::read_keypoints(&folder, &names).unwrap();
-    let frames: Vec<Frames> = frames
-        .into_iter()
-        .zip(&shift)
-        .map(|(f, &s)| f.into_iter().filter(|(k, _)| *k >= s).map(|(k, p)| (k - s, p)).collect())
-        .collect();
-    let json: serde_json::Value =
-        serde_json::from_str(&std::fs::read_to_string("/work/shared/data/pose2sim-4cam/cameras.json").unwrap())
-            .unwrap();
-    let truth: Vec<Se3> = json["cameras"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .map(|c| {
-            let m = |r: usize, k: usize| c["world_to_camera"][r][k].as_f64().unwrap();
-            Se3 {
-                rotation: std::array::from_fn(|r| std::array::from_fn(|k| m(r, k))),
-                translation: std::array::from_fn(|r| m(r, 3)),
-            }
-        })
-        .collect();
-    let kept = std::env::var("KEPT").is_ok();
-    let cameras = vec![
-        Camera {
-            size: [1088, 1920],
-            focal: None,
-            interval: 1.0 / 60.0,
-            offset: kept.then_some(0.0),
-            keep_offset: kept
-        };
-        4
-    ];
-    let begun = std::time::Instant::now();
-    let found = calibrate(&names, &cameras, &frames).unwrap();
-    let took = begun.elapsed();
-    let poses: Vec<Se3> = found.cameras.iter().map(|c| c.0).collect();
-    for (a, c) in apart(&poses, &truth).unwrap().iter().zip(&found.cameras) {
-        eprintln!("{:.2} degrees {:.2} % focal {:.0} center {:?}", a.degrees, 100.0 * a.center, c.1.focal, c.1.center);
+fn two_walkers_are_told_apart_and_bystanders_are_ignored() {
+    let studio = Studio::new(5);
+    let (first, second) = ([0.1, 0.0], [-0.4, 0.5]);
+    // The third camera shows only the second one.
+    let walkers = [vec![first, second], vec![second, first], vec![second], vec![first, second]];
+    let idle = [vec![[1.4, -0.9]], vec![[1.4, -0.9]], Vec::new(), Vec::new()];
+    let found = check(&studio, &Scene { idle, ..Scene::of(walkers) }, 4.0);
+    assert_eq!(found.people, 2);
+}
+
+#[test]
+fn swapped_sides_do_not_bend_the_rig() {
+    let studio = Studio::new(6);
+    check(&studio, &Scene { swapped: 0.2, ..Scene::of(std::array::from_fn(|_| vec![[0.0, 0.1]])) }, 3.0);
+}
+
+#[test]
+fn given_offsets_stay() {
+    let mut studio = Studio::new(7);
+    for (camera, offset) in studio.cameras.iter_mut().zip(&studio.offsets) {
+        (camera.offset, camera.keep_offset) = (Some(*offset), true);
     }
-    let frames: Vec<f64> = found
-        .offsets
-        .iter()
-        .zip(&shift)
-        .map(|(o, &s)| 60.0 * (o - found.offsets[0]) - s as f64 + shift[0] as f64)
-        .collect();
-    eprintln!(
-        "offsets off by frames {frames:.2?} people {} positions {} error {:.1} apart {:.1} took {took:?}",
-        found.people, found.positions, found.error, found.apart
-    );
+    let found = check(&studio, &Scene::of(std::array::from_fn(|_| vec![[0.0, 0.1]])), 4.0);
+    assert_eq!(found.offsets, studio.offsets);
+}
+
+#[test]
+fn a_camera_that_shows_somebody_else_is_refused_by_name() {
+    let studio = Studio::new(8);
+    let (first, other) = ([0.1, 0.0], [-0.4, 0.5]);
+    let scene = Scene::of([vec![first], vec![first], vec![other], vec![first]]);
+    let e = calibrate(&NAMES, &studio.cameras, &scene.detections(&studio, 4.0)).unwrap_err().to_string();
+    assert!(e.contains("no pose to c"), "{e}");
+    let scene =
+        Scene { idle: Scene::of(std::array::from_fn(|_| vec![first])).walkers, ..Scene::of(Default::default()) };
+    let e = calibrate(&NAMES, &studio.cameras, &scene.detections(&studio, 4.0)).unwrap_err().to_string();
+    assert!(e.contains("no person moves in the images of camera a"), "{e}");
+}
+
+#[test]
+fn tracks_survive_short_gaps_and_crossing_lists() {
+    let at = |x: f64| -> Person { (0..5).map(|k| [x + 60.0 * k as f64, 90.0 * k as f64, 0.9]).collect() };
+    let mut frames = Frames::new();
+    for k in 0..40 {
+        let (a, b) = (at(100.0 + 4.0 * k as f64), at(900.0 - 8.0 * k as f64));
+        let people = match k {
+            10..14 => vec![b],
+            _ if k % 3 == 0 => vec![b, a],
+            _ => vec![a, b],
+        };
+        frames.insert(k, people);
+    }
+    let tracks = track::linked(&frames, FRAME, 6.0);
+    let shown = |t: &Track| (0..40).filter(|k| t.near(*k as f64 * FRAME).is_some()).count();
+    assert_eq!(tracks.iter().map(shown).collect::<Vec<_>>(), [40, 36]);
+    let seen = tracks[0].seen(20.0 * FRAME, 0).unwrap();
+    assert!((seen.pixel[0] - 740.0 / 6.0).abs() < 1e-9 && (seen.velocity[0] + 40.0).abs() < 1e-9, "{seen:?}");
 }
