@@ -100,7 +100,7 @@ fn a_walker_calibrates_and_synchronises_cameras_at_right_angles() {
 }
 
 #[test]
-fn two_walkers_are_told_apart_and_bystanders_are_ignored() {
+fn two_walkers_are_distinguished_and_bystanders_ignored() {
     let studio = Studio::new(5);
     let (first, second) = ([0.1, 0.0], [-0.4, 0.5]);
     // The third camera shows only the second one.
