@@ -9,7 +9,7 @@ mod people;
 mod solve;
 
 pub(crate) use keypoints::{Frames, read_keypoints};
-pub(crate) use people::{Calibrated, calibrate};
+pub(crate) use people::calibrate;
 pub(crate) use solve::{Camera, Point, Sight, Solution, plane, solve};
 
 use crate::{Error, ErrorKind, Result};

@@ -12,7 +12,8 @@ mod pairs;
 mod rig;
 mod track;
 
-pub(crate) use check::Calibrated;
+#[cfg(test)]
+use check::Calibrated;
 pub(crate) use finish::calibrate;
 
 use super::solve::Camera;
@@ -93,7 +94,7 @@ impl Cameras<'_> {
         Lens::plain(focal, camera.size[0], camera.size[1]).scaled(1.0 / error_of(camera))
     }
 
-    /// Keypoints of a rig's people that two placed cameras show or more, at so many times of each.
+    /// Keypoints of a rig's people that two or more placed cameras show, at up to `times` times of each person.
     fn spots(&self, rig: &Rig, times: usize) -> Vec<Spot> {
         let mut out = Vec::new();
         for (p, person) in rig.people.iter().enumerate() {
@@ -120,7 +121,7 @@ impl Cameras<'_> {
         out
     }
 
-    /// Times at which two placed cameras show a person, at most so many, each after a movement.
+    /// Times at which two placed cameras show a person, at most `count`, each after a movement.
     fn times(&self, rig: &Rig, person: &Identity, count: usize) -> Vec<f64> {
         let placed = rig.placed();
         let span = |c: &usize| {

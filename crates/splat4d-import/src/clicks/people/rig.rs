@@ -1,5 +1,5 @@
-//! A rig of cameras that people are seen by: it starts with one person in two cameras, and grows by whatever camera shows
-//! one of its people, and by whoever its cameras show.
+//! Growing a rig: it starts with one person in two cameras, and gains each camera that shows one of its people, and each
+//! person that its cameras show.
 
 use super::bundle::{BEFORE, How};
 use super::pairs::Fit;
@@ -99,7 +99,7 @@ impl Cameras<'_> {
         best.map(|b| b.1)
     }
 
-    /// Adds whoever placed cameras show: another track of a known person, or a further person. False: there is none.
+    /// Adds people that placed cameras show: another track of a known person, or a further person. False: there is none.
     pub(super) fn extend(&self, rig: &mut Rig) -> bool {
         let placed = rig.placed();
         let free = |c: usize, rig: &Rig| (0..self.tracks[c].len()).filter(|&k| !rig.has(c, k)).collect::<Vec<_>>();
