@@ -169,9 +169,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
     let placed = match (&request.keypoints, &clicks) {
-        (Some(folder), _) => {
-            Some(people::placed(folder, &cameras, &pictures, &mut known, &clock, &kept, &mut report)?)
-        }
+        (Some(folder), _) => Some(people::placed(folder, &cameras, &pictures, &mut known, &clock, &kept, &mut report)?),
         (None, Some(clicks)) => Some(assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?),
         (None, None) => None,
     };

@@ -21,6 +21,11 @@ const MOST_ERROR: f64 = 2.0;
 /// A keypoint is explained within this many errors (24 px of 1920); share of a camera's keypoints that must be.
 const EXPLAINED: f64 = 4.0;
 const LEAST_EXPLAINED: f64 = 0.7;
+/// A camera contradicts the others where its median distance exceeds this many errors (7 px of 1920) and this many times
+/// the median of the others. Cameras that showed another person (Pose2Sim's demo, synthetic people): 1.4 to 1.8 errors,
+/// 2.4 to 3.2 times; cameras that showed the same one: at most 1.0 and 1.4.
+const ODD: f64 = 1.2;
+const ODD_RATIO: f64 = 1.8;
 /// Rigs of two halves of the keypoints that differ by more, degrees, determine no rig: each half is less accurate than
 /// all. Pose2Sim's demo: halves 4 degrees apart, the rig of all within 1.6.
 const MOST_APART: f64 = 8.0;
@@ -38,6 +43,44 @@ pub(crate) struct Calibrated {
     pub error: f64,
     /// Degrees by which the rigs of two halves of the keypoints differ, at worst.
     pub apart: f64,
+}
+
+/// A camera whose keypoints contradict the others, errors.
+struct Odd {
+    camera: usize,
+    /// Median distance, and that of the other cameras.
+    median: f64,
+    others: f64,
+    /// Share of keypoints that are explained.
+    explained: f64,
+}
+
+/// Distances of keypoints from where a rig sees them, errors, by camera.
+fn distances(rig: &Rig, spots: &[Spot]) -> Vec<Vec<f64>> {
+    let mut all = vec![Vec::new(); rig.poses.len()];
+    for spot in spots {
+        let Some(x) = spot.place else { continue };
+        for (c, seen) in &spot.seen {
+            if let Some(pose) = &rig.poses[*c] {
+                all[*c].push(off(&rig.lenses[*c], pose, x, seen.pixel));
+            }
+        }
+    }
+    all
+}
+
+/// The camera that contradicts the others most; none: they agree.
+fn odd(distances: &[Vec<f64>]) -> Option<Odd> {
+    let medians: Vec<f64> = distances.iter().map(|d| median(&mut d.clone()).unwrap_or(f64::INFINITY)).collect();
+    let of = |camera: usize| {
+        let mut others: Vec<f64> = (0..medians.len()).filter(|&o| o != camera).map(|o| medians[o]).collect();
+        let others = median(&mut others).unwrap_or(f64::INFINITY);
+        let all = &distances[camera];
+        let explained = all.iter().filter(|d| **d < EXPLAINED).count() as f64 / all.len().max(1) as f64;
+        Odd { camera, median: medians[camera], others, explained }
+    };
+    let contradicts = |o: &Odd| o.explained < LEAST_EXPLAINED || o.median > ODD && o.median > ODD_RATIO * o.others;
+    (0..medians.len()).map(of).filter(contradicts).max_by(|a, b| a.median.total_cmp(&b.median))
 }
 
 impl Cameras<'_> {
@@ -65,7 +108,8 @@ impl Cameras<'_> {
     /// The best rig, unless it may be wrong.
     pub(super) fn checked(&self, names: &[&str], rigs: &[(Rig, Vec<Spot>)]) -> Result<Calibrated> {
         const BY_HAND: &str = "or align the cameras by hand (--assist)";
-        let Some((rig, spots)) = rigs.first() else {
+        let whole = |(r, s): &(Rig, Vec<Spot>)| r.placed().len() == names.len() && odd(&distances(r, s)).is_none();
+        let Some((rig, spots)) = rigs.iter().find(|r| whole(r)).or(rigs.first()) else {
             return Err(Error::input("the keypoints of people give no poses to the cameras")
                 .remedy(format!("Give keypoints of people who walk through the shared space, {BY_HAND}.")));
         };
@@ -78,31 +122,25 @@ impl Cameras<'_> {
                      (use = false), {BY_HAND}."
                 )));
         }
-        let distances = |c: usize| -> Vec<f64> {
-            let seen = spots.iter().filter_map(|s| Some((s.place?, s.seen.iter().find(|v| v.0 == c)?.1)));
-            let pose = rig.poses[c].expect("all are placed");
-            seen.map(|(x, seen)| off(&rig.lenses[c], &pose, x, seen.pixel)).collect()
-        };
-        let by_camera: Vec<Vec<f64>> = (0..names.len()).map(distances).collect();
+        let by_camera = distances(rig, spots);
         let positions = by_camera.iter().map(Vec::len).sum();
         let error = median(&mut by_camera.concat()).unwrap_or(f64::INFINITY);
         let pixels = |errors: f64| errors * NOISE;
-        for (c, all) in by_camera.iter().enumerate() {
-            let share = all.iter().filter(|d| **d < EXPLAINED).count() as f64 / all.len().max(1) as f64;
-            if share < LEAST_EXPLAINED {
-                return Err(Error::input(format!(
-                    "the keypoints of camera {} contradict those of the others: {:.0} % of {} positions are within {:.0} px \
-                     (of 1920) of where the others see them",
-                    names[c],
-                    100.0 * share,
-                    all.len(),
-                    pixels(EXPLAINED)
-                ))
-                .remedy(format!(
-                    "Check that its keypoints and frame numbers belong to its video, set its time offset in import.toml, \
-                     leave it out (use = false), {BY_HAND}."
-                )));
-            }
+        if let Some(odd) = odd(&by_camera) {
+            return Err(Error::input(format!(
+                "the keypoints of camera {} contradict those of the others: half of {} positions are more than {:.0} px (of \
+                 1920) from where the others see them ({:.0} px in the other cameras), {:.0} % more than {:.0} px",
+                names[odd.camera],
+                by_camera[odd.camera].len(),
+                pixels(odd.median),
+                pixels(odd.others),
+                100.0 * (1.0 - odd.explained),
+                pixels(EXPLAINED)
+            ))
+            .remedy(format!(
+                "Check that its keypoints and frame numbers belong to its video and show a person of the other cameras, set \
+                 its time offset in import.toml, leave it out (use = false), {BY_HAND}."
+            )));
         }
         if error > MOST_ERROR {
             return Err(Error::input(format!(
@@ -112,8 +150,8 @@ impl Cameras<'_> {
             ))
             .remedy(format!("Use a more accurate detector, set time offsets in import.toml, {BY_HAND}.")));
         }
-        let rivals = rigs[1..].iter().filter(|(r, _)| r.placed().len() == names.len() && r.gain > AMBIGUOUS * rig.gain);
-        for (rival, _) in rivals {
+        let rivals = rigs.iter().filter(|r| r.0.gain > AMBIGUOUS * rig.gain && whole(r));
+        for (rival, _) in rivals.filter(|r| !std::ptr::eq(&r.0, rig)) {
             let apart = self.apart(rig, rival);
             let worst = (0..names.len()).max_by(|&a, &b| apart[a].total_cmp(&apart[b])).unwrap_or(0);
             if apart[worst] > DISTINCT {
