@@ -23,7 +23,7 @@ const EXPLAINED: f64 = 4.0;
 const LEAST_EXPLAINED: f64 = 0.7;
 /// A camera contradicts the others where its median distance exceeds this many errors (7 px of 1920) and this many times
 /// the median of the others. Cameras that showed another person (Pose2Sim's demo, synthetic people): 1.4 to 1.8 errors,
-/// 2.4 to 3.2 times; cameras that showed the same one: at most 1.0 and 1.4.
+/// 2.4 to 3.1 times; cameras that showed the same one: at most 1.0 and 1.2.
 const ODD: f64 = 1.2;
 const ODD_RATIO: f64 = 1.8;
 /// Rigs of two halves of the keypoints that differ by more, degrees, determine no rig: each half is less accurate than

@@ -19,6 +19,15 @@ const MEETINGS: usize = 15;
 /// Times of a person in trials.
 pub(super) const TRIALS: usize = 10;
 
+/// A camera that joins a rig by a person that its track shows.
+struct Joining {
+    camera: usize,
+    person: usize,
+    track: usize,
+    pose: Se3,
+    offset: f64,
+}
+
 impl Cameras<'_> {
     /// The rig that a pair starts, with all cameras that follow; none: the pair is none.
     pub(super) fn grown(&self, start: &Fit, fits: &[Fit]) -> Option<Rig> {
@@ -41,8 +50,7 @@ impl Cameras<'_> {
         let mut spots = self.spots(&rig, TRIALS);
         self.adjusted(&mut rig, &mut spots, How::TRIAL)?;
         loop {
-            let found = self.next(&rig, &spots, fits);
-            if let Some((camera, person, track, pose, offset)) = found {
+            if let Some(Joining { camera, person, track, pose, offset }) = self.next(&rig, &spots, fits) {
                 (rig.poses[camera], rig.offsets[camera]) = (Some(pose), offset);
                 rig.lenses[camera].focal =
                     self.of[camera].focal.map_or(rig.lenses[a].focal, |_| rig.lenses[camera].focal);
@@ -67,9 +75,9 @@ impl Cameras<'_> {
         }
     }
 
-    /// The camera and track that fit the people of a rig best: camera, person, track, pose and offset.
-    fn next(&self, rig: &Rig, spots: &[Spot], fits: &[Fit]) -> Option<(usize, usize, usize, Se3, f64)> {
-        let mut best: Option<(f64, (usize, usize, usize, Se3, f64))> = None;
+    /// The camera and track that fit the people of a rig best.
+    fn next(&self, rig: &Rig, spots: &[Spot], fits: &[Fit]) -> Option<Joining> {
+        let mut best: Option<(f64, Joining)> = None;
         for c in (0..self.of.len()).filter(|&c| rig.poses[c].is_none()) {
             for k in 0..self.tracks[c].len() {
                 for (p, person) in rig.people.iter().enumerate() {
@@ -91,7 +99,8 @@ impl Cameras<'_> {
                     let Some(found) = place(&known, &[lens], false, ROUGH, rng) else { continue };
                     let share = found.inliers.len() as f64 / known.len() as f64;
                     if share >= SHARE && best.as_ref().is_none_or(|b| share > b.0) {
-                        best = Some((share, (c, p, k, found.model.pose, offset)));
+                        let joining = Joining { camera: c, person: p, track: k, pose: found.model.pose, offset };
+                        best = Some((share, joining));
                     }
                 }
             }
