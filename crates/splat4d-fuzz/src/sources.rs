@@ -38,6 +38,7 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("capture/splits.rs", By(&["split_list", "nerfies_split"])),
     ("capture/stray.rs", Not("a word is looked for in the first bytes")),
     ("capture/tracks.rs", By(&["tracks_npz", "tracks_csv"])),
+    ("clicks/keypoints.rs", By(&["keypoints"])),
     ("clicks/mod.rs", By(&["clicks"])),
     ("comparing.rs", By(&["results_json", "per_view_json"])),
     ("compressing.rs", By(&["compress_toml"])),

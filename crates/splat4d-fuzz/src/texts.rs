@@ -31,6 +31,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "clicks", seeds: || seeds(&[CLICKS]), read: clicks },
     Reader { name: "compress_toml", seeds: || seeds(&[ORDER]), read: |b| drop(texts::compress_order(&text(b))) },
     Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
+    Reader { name: "keypoints", seeds: || seeds(&[KEYPOINTS, COCO]), read: keypoints },
     Reader { name: "model_toml", seeds: models, read: |b| drop(texts::model(&text(b))) },
     Reader { name: "rig_cameras", seeds: || seeds(&[RIG]), read: |b| drop(generated::check_cameras(b)) },
     Reader { name: "predicted_npz", seeds: predictions, read: |b| drop(predicted::check_archive(b)) },
@@ -197,6 +198,21 @@ fn corrections(bytes: &[u8]) {
         if let Ok(read) = Corrections::read(folder, &["a".into(), "b".into()]) {
             read.cameras.iter().for_each(|c| assert!(c.given_offset().is_none_or(f64::is_finite)));
         }
+    });
+}
+
+/// Keypoints of a frame as OpenPose writes them, and of a camera as COCO has them.
+const KEYPOINTS: &str =
+    r#"{"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": [694.6, 531.5, 0.69, 0, 0, 0]}]}"#;
+const COCO: &str = r#"{"images": [{"id": 7, "file_name": "a/000001.jpg"}],
+    "annotations": [{"image_id": 7, "keypoints": [3, 4, 2, 5, 6.5, 1]}, {"image_id": 3, "keypoints": []}]}"#;
+
+/// As the file of a frame, and as that of a camera.
+fn keypoints(bytes: &[u8]) {
+    in_folder("a.json", bytes, |folder| drop(check_clicks(folder, &["a"])));
+    in_folder("1.json", bytes, |folder| {
+        let (Some(parent), Some(name)) = (folder.parent(), folder.file_name().and_then(|n| n.to_str())) else { return };
+        drop(check_clicks(parent, &[name]));
     });
 }
 

@@ -12,7 +12,8 @@
 //! | `video/` | images with timestamps: `ffmpeg` and `ffprobe` through pipes, folders of images, motion JPEG in AVI without a program; recordings in several files (`chapters.rs`), rate, lost and doubled frames (`clock.rs`) |
 //! | `sync/` | synchronisation: lags of pairs by sound, motion (a guess) and epipolar geometry, offsets of all by robust least squares (`graph.rs`) |
 //! | `sfm/`, `sfm/mapper/` | structure from motion: views (`pictures.rs`), tracks, two-view geometry, resection, locally optimised consensus (`sample.rs`), the mapper, exact positions by aligning windows (`overlay.rs`), bundle adjustment with lenses and time offsets, known cameras, up direction, walls and unit (`align.rs`) |
-//! | `clicks/` | points that a user clicked in several cameras: their file, and the poses, focal lengths and time offsets that they determine |
+//! | `clicks/` | points that a user clicked in several cameras: their file, and the poses, focal lengths and time offsets that they determine; keypoints of people in all frames (`keypoints.rs`) |
+//! | `clicks/people/` | the same poses, lenses and offsets from people: tracks, pairs that may be one person (`pairs.rs`), rigs that grow (`rig.rs`), refusal of rigs that may be wrong (`check.rs`) |
 //! | `corrections.rs` | `import.toml`: results per camera, corrected by hand and read again |
 //! | `write/` | images, masks, times and `capture.json`, continued after an interruption |
 //! | `shipped.rs` | frames of captures shipped as a video per camera with poses (Neural 3D Video) |

@@ -94,6 +94,9 @@ pub(crate) struct Args {
     /// Use the clicked points of this file, without a page; with --assist, start the page from it
     #[arg(long, value_name = "FILE", conflicts_with = "colmap")]
     points: Option<PathBuf>,
+    /// Calibrate the cameras by keypoints of people in every frame: a folder with NAME/ or NAME.json of each camera
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["colmap", "points", "assist"])]
+    keypoints: Option<PathBuf>,
     /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
@@ -216,6 +219,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         masks: args.masks.clone(),
         synchronous: args.synchronous,
         points: args.points.clone(),
+        keypoints: args.keypoints.clone(),
     };
     let stop = interrupt::flag("stopping: stored results are kept");
     if args.assist {

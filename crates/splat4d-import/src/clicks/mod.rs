@@ -1,10 +1,15 @@
 //! Points that a user clicked in the images of several cameras: their file, and the rig that they determine.
 //!
 //! Cameras at right angles share no features, but a person recognises the same corner in all of them. Six to eight such
-//! points are enough for the poses of a rig (`solve.rs`); an event that all cameras show synchronises them.
+//! points are enough for the poses of a rig (`solve.rs`); an event that all cameras show synchronises them. Without
+//! clicks, keypoints of people in all cameras (`keypoints.rs`) calibrate and synchronise them (`people/`).
 
+mod keypoints;
+mod people;
 mod solve;
 
+pub(crate) use keypoints::{Frames, read_keypoints};
+pub(crate) use people::calibrate;
 pub(crate) use solve::{Camera, Point, Sight, Solution, plane, solve};
 
 use crate::{Error, ErrorKind, Result};
@@ -73,9 +78,13 @@ pub(crate) struct Length {
     pub metres: f64,
 }
 
-/// Reads a file of clicked points of cameras with these names. Errors: those of `import --points`.
+/// Reads a file of clicked points of cameras with these names, or a folder of keypoints. Errors: those of `import --points`
+/// and `--keypoints`.
 pub fn check_clicks(path: &Path, names: &[&str]) -> Result<()> {
-    Clicks::read(path, names).map(drop)
+    match path.is_dir() {
+        true => read_keypoints(path, names).map(drop),
+        false => Clicks::read(path, names).map(drop),
+    }
 }
 
 impl Clicks {

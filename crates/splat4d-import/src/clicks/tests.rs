@@ -7,19 +7,19 @@ use splat4d::math::se3::mat_mul;
 use splat4d::math::{Rng, Se3};
 
 /// Seconds between frames.
-const FRAME: f64 = 1.0 / 30.0;
+pub(super) const FRAME: f64 = 1.0 / 30.0;
 
 /// Four cameras at right angles, about four metres from what they show.
-struct Studio {
-    poses: Vec<Se3>,
-    lenses: Vec<Lens>,
-    cameras: Vec<Camera>,
+pub(super) struct Studio {
+    pub(super) poses: Vec<Se3>,
+    pub(super) lenses: Vec<Lens>,
+    pub(super) cameras: Vec<Camera>,
     /// Seconds that are added to each clock.
-    offsets: Vec<f64>,
+    pub(super) offsets: Vec<f64>,
 }
 
 impl Studio {
-    fn new(seed: u64) -> Self {
+    pub(super) fn new(seed: u64) -> Self {
         let rng = Rng::new(seed, "studio", 0);
         let pose = |c: usize| {
             let angle = std::f64::consts::FRAC_PI_2 * c as f64 + 0.1 * rng.normal(c as u64);

@@ -12,6 +12,7 @@ mod fixed;
 mod geometry;
 mod given;
 mod inputs;
+mod people;
 mod poses;
 mod report;
 mod soundtrack;
@@ -87,6 +88,8 @@ pub struct Request {
     pub synchronous: bool,
     /// Points that the user clicked (`Desk`), which give poses, focal lengths and time offsets.
     pub points: Option<PathBuf>,
+    /// A folder with keypoints of people in all frames, which give the same without clicks.
+    pub keypoints: Option<PathBuf>,
 }
 
 /// Pixels of the shorter side that images get: training on a CPU resolves no more.
@@ -115,6 +118,7 @@ impl Request {
             masks: None,
             synchronous: false,
             points: None,
+            keypoints: None,
         }
     }
 }
@@ -136,7 +140,8 @@ const CONTRADICTS: f64 = 5.0;
 /// A calibration that more than this part of the judged cameras contradict belongs to another recording.
 const CONTRADICTED: f64 = 0.67;
 /// The remedy where images of fixed cameras have too few matches.
-const BY_HAND: &str = "or click a few points in all cameras (--assist, docs/assist.md); or ";
+const BY_HAND: &str =
+    "or click a few points in all cameras (--assist, docs/assist.md), or give keypoints of people (--keypoints); or ";
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -163,8 +168,12 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
-    if let Some(clicks) = &clicks {
-        let placed = assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?;
+    let placed = match (&request.keypoints, &clicks) {
+        (Some(folder), _) => Some(people::placed(folder, &cameras, &pictures, &mut known, &clock, &kept, &mut report)?),
+        (None, Some(clicks)) => Some(assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?),
+        (None, None) => None,
+    };
+    if let Some(placed) = placed {
         told.iter_mut().zip(&placed.offsets).for_each(|(t, o)| *t = o.or(*t));
         clock = clocks::solve(&cameras, &heard, &told);
         clicked = Some(placed.origin);
