@@ -27,8 +27,6 @@ const LOOKS: usize = 6;
 const VELOCITY_CAP: f64 = 0.05;
 /// A frame may always add this many Gaussians.
 const LEAST_GROWTH: usize = 64;
-/// The first frame takes as many Gaussians as it may, and what appears later needs some too.
-const HEADROOM: f64 = 1.25;
 
 /// Steps until all stages are done. Returns whether they are: a stop was requested otherwise.
 ///
@@ -189,8 +187,9 @@ fn frame_recipe(recipe: &Recipe, rows: usize) -> Recipe {
     let short = first_recipe(recipe).with(|r| {
         r.run.iterations = r.follow.frame_steps;
         r.run.half_size_until = 0.0;
-        let most = (HEADROOM * r.densify.max_cap as f64) as usize;
-        r.densify.max_cap = (rows + growth).min(most.max(rows));
+        // Rates of positions depend on the largest number, which is that of the first frame. More for later frames (25 %)
+        // were spread over what moves and gained nothing where an object appears.
+        r.densify.max_cap = (rows + growth).min(r.densify.max_cap.max(rows));
         r.floaters.interval = 0;
         r.opacity_reset.interval = 0;
     });
