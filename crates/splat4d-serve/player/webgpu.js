@@ -117,7 +117,9 @@ export class WebGPUBackend {
   #picture = null;
   #pictureView = null;
   #timer = null;
-  #reading = false;
+  /// The reading of counts that is in progress; whether a later image's were not copied because of it.
+  #reading = null;
+  #missed = false;
   #rangeStart = new Uint32Array([0xffffffff, 0]);
 
   /// Throws SceneError where WebGPU is missing or refuses; the canvas can then still be used for WebGL2.
@@ -338,9 +340,10 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Resolves when the last image is complete. Throws what the device complained about.
+  /// Resolves when the last image is complete and `stats` are its own. Throws what the device complained about.
   async settled() {
     if (!this.#gone) await this.#queue.onSubmittedWorkDone();
+    while (this.#reading) await this.#reading;
     if (this.#error) throw this.#error;
   }
 
@@ -629,7 +632,8 @@ export class WebGPUBackend {
 
   /// Copies counts and times to where they can be read, unless a reading is still in progress.
   #copyStats(encoder) {
-    if (this.#reading) return false;
+    this.#missed = !!this.#reading;
+    if (this.#missed) return false;
     encoder.copyBufferToBuffer(this.#b.arguments, 0, this.#b.readback, 0, ARGUMENT_BYTES);
     if (this.#timer) {
       encoder.resolveQuerySet(this.#timer, 0, 4, this.#b.times, 0);
@@ -638,23 +642,29 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Without a timer drawMs is the time from the call to the image's end, sort included.
+  /// Without a timer drawMs is the time from the call to the image's end, sort included; a late reading has no `start`.
   #readStats(start) {
-    this.#reading = true;
     const { readback } = this.#b, { stats } = this;
-    readback.mapAsync(GPUMapMode.READ).then(() => {
+    this.#reading = readback.mapAsync(GPUMapMode.READ).then(() => {
       const data = readback.getMappedRange();
       stats.drawn = new Uint32Array(data, 0, COUNT_INDEX + 1)[COUNT_INDEX];
       if (this.#timer) {
         const t = new BigUint64Array(data, ARGUMENT_BYTES, 4);
         stats.sortMs = Number(t[1] - t[0]) / 1e6;
         stats.drawMs = Number(t[3] - t[2]) / 1e6;
-      } else {
+      } else if (start) {
         stats.drawMs = performance.now() - start;
       }
       readback.unmap();
-      this.#reading = false;
-    }, () => {}); // The device is lost; nothing is rendered any more.
+      this.#reading = null;
+      // The last image's counts would never be read: no later image may come.
+      if (this.#missed && !this.#gone) {
+        const encoder = this.#device.createCommandEncoder();
+        this.#copyStats(encoder);
+        this.#queue.submit([encoder.finish()]);
+        this.#readStats(0);
+      }
+    }, () => { this.#reading = null; }); // The device is lost; nothing is rendered any more.
   }
 
   #makePicture() {

@@ -107,6 +107,25 @@ for (const [channel, time] of Object.entries(SHOWN).flatMap(([c, times]) => time
   });
 }
 
+test('counts are those of the last image, also where images follow faster than counts are read', options, async () => {
+  const counts = await tab.evaluate(async ([s, times, what]) => {
+    await scene(s, what.view[1], what.view[2]);
+    const show = (time) => backend.draw({ ...what, time, channel: 'color', view: toy.view(...what.view) });
+    const alone = [];
+    for (const time of times) {
+      show(time);
+      await backend.settled();
+      alone.push(backend.stats.drawn);
+    }
+    // The first one's reading is in progress when the second is rendered.
+    for (const time of times.slice(0, 2)) show(time);
+    await backend.settled();
+    return { alone, last: backend.stats.drawn };
+  }, [SCENE, [0.3, 0.7, 1], LOOK]);
+  assert.equal(new Set(counts.alone).size, 3, JSON.stringify(counts));
+  assert.equal(counts.last, counts.alone[1]);
+});
+
 test('from a camera among the Gaussians no block is culled too early', options, async (t) => {
   const setup = { pages: [[0, 5000, { from: 0, to: 1, logScale: [-5, -1.7], size: 2, edges: true, seed: 9 }]] };
   for (const eye of [[0.4, 0.1, 0.3], [-1.2, 0.3, -0.2], [2, -2, 0.1]]) {
