@@ -123,26 +123,30 @@ pub(crate) fn carve_moving(
     let each = (MOVING_SHARE * count as f64 / times.len().max(1) as f64).ceil() as usize;
     let mut out = Seeds::default();
     for (k, &t) in times.iter().enumerate() {
-        let Some((mut views, t)) = rigs.moving(frames, &still, t)? else { break };
-        let share = |v: &View| v.wanted.iter().filter(|w| **w).count() as f64 / v.wanted.len() as f64;
-        views.retain(|v| share(v) <= MOVING_PICTURE);
-        if views.iter().filter(|v| v.wanted.contains(&true)).count() < MOVING_CAMERAS {
-            continue;
-        }
-        views.par_iter_mut().for_each(|v| v.wanted = grown(&v.wanted, v.camera.width));
-        let shown = |vote: &mut dyn FnMut(Silhouette<'_>)| {
-            for view in &views {
-                let color = |p: usize| view.colors[p].map(|b| f32::from(b) / 255.0);
-                vote(Silhouette { camera: &view.camera, inside: &|p| view.wanted[p], color: &color });
-            }
-            Ok(())
-        };
-        let silhouettes = Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown };
-        let mut kept = carve_time(&silhouettes, volume, each, rng.fork(k as u64))?;
+        let Some((views, t)) = rigs.moving(frames, &still, t)? else { break };
+        let mut kept = carve_views(views, volume, each, rng.fork(k as u64))?;
         kept.times.fill(Some(t));
         out.append(kept);
     }
     Ok(out)
+}
+
+/// About `count` points of what several cameras see in the pixels that they want; none where few of them do.
+pub(crate) fn carve_views(mut views: Vec<View>, volume: &Volume, count: usize, rng: Rng) -> Result<Seeds> {
+    let share = |v: &View| v.wanted.iter().filter(|w| **w).count() as f64 / v.wanted.len() as f64;
+    views.retain(|v| share(v) <= MOVING_PICTURE);
+    if views.iter().filter(|v| v.wanted.contains(&true)).count() < MOVING_CAMERAS {
+        return Ok(Seeds::default());
+    }
+    views.par_iter_mut().for_each(|v| v.wanted = grown(&v.wanted, v.camera.width));
+    let shown = |vote: &mut dyn FnMut(Silhouette<'_>)| {
+        for view in &views {
+            let color = |p: usize| view.colors[p].map(|b| f32::from(b) / 255.0);
+            vote(Silhouette { camera: &view.camera, inside: &|p| view.wanted[p], color: &color });
+        }
+        Ok(())
+    };
+    carve_time(&Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown }, volume, count, rng)
 }
 
 /// A mask that is larger by [`GROWN`] pixels to every side.

@@ -38,22 +38,20 @@ const CAMERAS: usize = 4;
 const MOMENTS: usize = 3;
 const STEPS: usize = 40;
 
-/// Four cameras, this many frames, on disk.
-fn capture_on_disk(moments: usize) -> TempDir {
+/// Some cameras, the ball as it is at these moments, on disk.
+fn capture_on_disk(rig: usize, moments: &[usize]) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let made = Made::new(CAMERAS, MOMENTS, SIZE);
+    let made = Made::new(rig, MOMENTS, SIZE);
     let mut picture = Picture::default();
-    for i in 0..CAMERAS * moments {
-        // Back and forth, so that it stays visible.
-        let moment = [0, 1, 2, 1][i / CAMERAS % 4];
-        made.load(CAMERAS * moment + i % CAMERAS, &mut picture).unwrap();
-        let path = folder.path().join(format!("images/{}/{:04}.png", i % CAMERAS, i / CAMERAS));
+    for i in 0..rig * moments.len() {
+        made.load(rig * moments[i / rig] + i % rig, &mut picture).unwrap();
+        let path = folder.path().join(format!("images/{}/{:04}.png", i % rig, i / rig));
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         let color = |x: u32, y: u32, c: usize| (picture.color.get(c, y as usize, x as usize) * 255.0).round() as u8;
         let pixel = |x: u32, y: u32| image::Rgb([0, 1, 2].map(|c| color(x, y, c)));
         image::RgbImage::from_fn(SIZE as u32, SIZE as u32, pixel).save(path).unwrap();
     }
-    let cameras: Vec<Value> = (0..CAMERAS)
+    let cameras: Vec<Value> = (0..rig)
         .map(|i| {
             let (c, pose) = (made.camera(i), &made.camera(i).cam_from_world);
             let row = |r: usize| {
@@ -98,9 +96,14 @@ impl Place {
         Self::of(MOMENTS)
     }
 
-    /// Of a longer take.
+    /// Of a longer take: back and forth, so that the ball stays visible.
     pub(crate) fn of(moments: usize) -> Self {
-        Self { capture: capture_on_disk(moments), runs: tempfile::tempdir().unwrap() }
+        Self::filmed(CAMERAS, &(0..moments).map(|k| [0, 1, 2, 1][k % 4]).collect::<Vec<_>>())
+    }
+
+    /// Of some cameras, the ball as it is at these moments.
+    pub(crate) fn filmed(cameras: usize, moments: &[usize]) -> Self {
+        Self { capture: capture_on_disk(cameras, moments), runs: tempfile::tempdir().unwrap() }
     }
 
     pub(crate) fn run(&self, name: &str) -> PathBuf {

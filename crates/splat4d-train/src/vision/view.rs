@@ -37,10 +37,21 @@ pub(crate) struct View {
 }
 
 impl View {
-    fn new(camera: Camera, color: &Planes<f32>, wanted: Vec<bool>) -> Self {
+    pub(crate) fn new(camera: Camera, color: &Planes<f32>, wanted: Vec<bool>) -> Self {
         let byte = |v: f32| (v * 255.0).round().clamp(0.0, 255.0) as u8;
         let colors = (0..color.pixels()).map(|p| [0, 1, 2].map(|c| byte(color.plane(c)[p]))).collect();
         Self { camera, colors, grey: grey(color), wanted }
+    }
+
+    /// Wants only pixels whose colour differs by more than `limit` (mean of the channels, in [0, 1]) from that in another
+    /// image; differences are blurred by `blur` pixels.
+    pub(crate) fn keep_unlike(&mut self, other: &[[u8; 3]], limit: f32, blur: f64) {
+        let mut off = self.grey.clone();
+        for ((v, own), other) in off.data.iter_mut().zip(&self.colors).zip(other) {
+            *v = (0..3).map(|c| f32::from(own[c].abs_diff(other[c]))).sum::<f32>() / (3.0 * 255.0);
+        }
+        let off = blurred(&off, blur);
+        self.wanted.iter_mut().zip(&off.data).for_each(|(w, v)| *w &= *v > limit);
     }
 
     /// Whether points are searched for in a pixel.
@@ -121,14 +132,10 @@ impl Rigs {
         };
         let differing = |(rig, still): (&Vec<usize>, &View)| -> Result<View> {
             let mut view = single(frames, nearest(rig))?;
-            let mut off = view.grey.clone();
-            for (p, v) in off.data.iter_mut().enumerate() {
-                let channel = |c: usize| view.colors[p][c].abs_diff(still.colors[p][c]);
-                *v = (0..3).map(|c| f32::from(channel(c))).sum::<f32>() / (3.0 * 255.0);
+            view.keep_unlike(&still.colors, MOVED, MOVED_BLUR);
+            if rig.len() < MEDIAN_FROM {
+                view.wanted.fill(false);
             }
-            let off = blurred(&off, MOVED_BLUR);
-            let few = rig.len() < MEDIAN_FROM;
-            view.wanted.iter_mut().zip(&off.data).for_each(|(w, v)| *w = *w && *v > MOVED && !few);
             Ok(view)
         };
         let views = rigs.par_iter().zip(still).map(differing).collect::<Result<Vec<View>>>()?;

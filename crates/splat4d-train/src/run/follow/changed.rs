@@ -12,6 +12,7 @@ use crate::capture::frames::{Frames, Picture};
 use crate::run::dataset::Dataset;
 use crate::run::metrics::psnr;
 use crate::train_state::Exposure;
+use crate::vision::view::View;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::scene::{Planes, Table};
 
@@ -23,6 +24,11 @@ const SEEN: f32 = 0.05;
 /// errors that stay must not make a tile change forever.
 const RISE: (f32, f32) = (1.1, 1e-3);
 
+/// A pixel shows something that is not in the scene where colours are further off than this (mean of the channels, in
+/// [0, 1]), blurred by so many pixels: edges that are off by a pixel are not. Chosen where the bundled crate appears: as
+/// good as 0.1 and 1 pixel with four times the points (studies/records/2026-11-28-follow.md).
+const NEW_HERE: (f32, f64) = (0.2, 2.0);
+
 /// Mean absolute errors of the tiles of all views, one after the other.
 pub(super) type TileErrors = Vec<f32>;
 
@@ -32,6 +38,18 @@ struct Compared {
     /// Tiles in a row.
     across: usize,
     mse: f64,
+}
+
+impl Compared {
+    /// The tiles whose error rose by more than `rise` over that in `before`, where this view's begin at `first`, and their
+    /// neighbours; none: it is no tile.
+    fn changed(&self, before: &TileErrors, first: &mut usize, rise: f32) -> Option<Vec<bool>> {
+        let known = before.get(*first..*first + self.tiles.len());
+        *first += self.tiles.len();
+        let own: Vec<bool> =
+            (0..self.tiles.len()).map(|t| self.tiles[t] > known.map_or(0.0, |known| known[t]) + rise).collect();
+        own.contains(&true).then(|| dilated(&own, self.across))
+    }
 }
 
 /// Renders views of one frame and compares them with its images.
@@ -87,21 +105,36 @@ impl Comparison<'_> {
         let mut first = 0;
         for i in 0..self.frames.len() {
             let view = self.view(i, &mut work, &mut picture)?;
-            let known = before.get(first..first + view.tiles.len());
-            first += view.tiles.len();
-            let own: Vec<bool> =
-                (0..view.tiles.len()).map(|t| view.tiles[t] > known.map_or(0.0, |known| known[t]) + rise).collect();
-            if !own.contains(&true) {
+            let Some(changed) = view.changed(before, &mut first, rise) else {
                 // Its pixels count as unchanged.
                 self.add(&mut work, i, &|_, _| 0.0, &mut sums);
                 continue;
-            }
-            let changed = dilated(&own, view.across);
+            };
             let at = |x: usize, y: usize| f32::from(u8::from(changed[y / TILE * view.across + x / TILE]));
             self.add(&mut work, i, &at, &mut sums);
         }
         let active = |(_, [changed, all]): &(usize, &[f32; 2])| *all > SEEN && *changed >= share * all;
         Ok(sums.iter().enumerate().filter(active).map(|(row, _)| row as u32).collect())
+    }
+
+    /// The images, of which those pixels are wanted that show something new: unlike the scene, in tiles that disagree (as
+    /// in [`rows`](Self::rows)).
+    pub(super) fn new_here(&self, before: &TileErrors, rise: f32) -> Result<Vec<View>> {
+        let (mut work, mut picture) = (Blended::default(), Picture::default());
+        let (mut first, mut out) = (0, Vec::new());
+        for i in 0..self.frames.len() {
+            let view = self.view(i, &mut work, &mut picture)?;
+            let changed = view.changed(before, &mut first, rise);
+            let (camera, width) = (&self.capture.frames[self.numbers[i]].view, picture.color.width);
+            let wanted = (0..picture.color.pixels()).map(|p| {
+                let filled = picture.weight.as_ref().is_none_or(|w| w.data[p] == 1.0);
+                filled && changed.as_ref().is_some_and(|c| c[p / width / TILE * view.across + p % width / TILE])
+            });
+            let mut shown = View::new(camera.clone(), &picture.color, wanted.collect());
+            shown.keep_unlike(&View::new(camera.clone(), &work.image.color, Vec::new()).colors, NEW_HERE.0, NEW_HERE.1);
+            out.push(shown);
+        }
+        Ok(out)
     }
 
     /// Adds each row's weight in pixels, times `changed` and as it is.

@@ -4,6 +4,7 @@ use super::changed::{Comparison, TileErrors, settled};
 use super::history::{History, gathered, still};
 use super::record::{NEW, Record};
 use crate::event::{Event, Progress};
+use crate::init::{self, InitSettings, Seeds, hull};
 use crate::methods::{TrainContext, still as still_method};
 use crate::recipe::Recipe;
 use crate::run::dataset::Dataset;
@@ -13,6 +14,7 @@ use crate::train_state::Exposure;
 use crate::{Error, ErrorKind, Result};
 use serde_json::Value;
 use splat4d::layers::Scene;
+use splat4d::math::Rng;
 use splat4d::scene::{GEOMETRY, Params, Space};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -27,6 +29,12 @@ const LOOKS: usize = 6;
 const VELOCITY_CAP: f64 = 0.05;
 /// A frame may always add this many Gaussians.
 const LEAST_GROWTH: usize = 64;
+/// Points for what appears, by pixel that shows it in an image (mean of all views).
+const PER_PIXEL: f64 = 2.0;
+/// Their opacity: there is no time to grow it from [`InitSettings::opacity`].
+const OPACITY: f64 = 0.5;
+/// What appears may have Gaussians beyond the number of the first frame, up to this factor on it.
+const ROOM: f64 = 1.25;
 
 /// Steps until all stages are done. Returns whether they are: a stop was requested otherwise.
 ///
@@ -88,9 +96,14 @@ impl Fit<'_> {
         if active.is_empty() {
             return record(Params::new(0, coefficients, &[]), Vec::new(), active, &scene);
         }
-        let recipe = frame_recipe(self.recipe, scene.len());
+        let rows = scene.len();
+        let extent = self.opened.plan(&frame_recipe(self.recipe, rows)).extent;
+        let mut scene = self.split(&active, extent, exposure.as_ref())?;
+        let seeds = self.appeared(&scene, exposure.as_ref(), rise)?;
+        let recipe = frame_recipe(self.recipe, rows + seeds.len());
         let plan = self.opened.plan(&recipe);
-        let scene = self.split(&active, &plan, exposure.as_ref())?;
+        let layer = &mut scene.layers[0];
+        *layer = still(self.learning(&layer.params, &self.begun(&recipe, &plan, &seeds)?)?);
         let mut stage = still_method::stage(&format!("frame {}", self.frame), &plan);
         stage.freeze_exposure = true;
         // The first frame has unlocked all degrees.
@@ -121,17 +134,45 @@ impl Fit<'_> {
         restored(self.exposure, self.opened.capture.cameras.len())
     }
 
+    /// Points of what appeared and is not in a scene.
+    fn appeared(&self, scene: &Scene<f32>, exposure: Option<&Exposure>, rise: f32) -> Result<Seeds> {
+        let views = self.compared(scene, exposure).new_here(self.errors, rise)?;
+        let pixels: usize = views.iter().map(|v| v.wanted.iter().filter(|w| **w).count()).sum();
+        let most = (ROOM * self.recipe.densify.max_cap as f64) as usize;
+        let count = (PER_PIXEL * pixels as f64 / views.len().max(1) as f64) as usize;
+        let volume = init::volume::common(self.opened.frames.as_ref());
+        let rng = Rng::new(self.recipe.run.seed, "appeared", self.frame as u64);
+        hull::carve_views(views, &volume, count.min(most.saturating_sub(scene.len())), rng)
+    }
+
+    /// The Gaussians that points begin as.
+    fn begun(&self, recipe: &Recipe, plan: &TrainContext, seeds: &Seeds) -> Result<Params<f32>> {
+        let settings = InitSettings { opacity: OPACITY, ..recipe.init.clone() };
+        let program = recipe.program()?;
+        let scene = init::scene(plan, &settings, program.as_ref(), seeds, self.shell.background, self.shell.up)?;
+        Ok(scene.layers.into_iter().next().expect("a scene has a layer").params)
+    }
+
+    /// Active Gaussians and new ones, with the place of each among the active ones.
+    fn learning(&self, active: &Params<f32>, new: &Params<f32>) -> Result<Params<f32>> {
+        let [known, rows] = [active.len() as u32, (active.len() + new.len()) as u32];
+        let (old, fresh): (Vec<u32>, Vec<u32>) = ((0..known).collect(), (0..rows - known).collect());
+        let mut own = gathered(&[(active, &old), (new, &fresh)], self.history.coefficients());
+        let key = own.entry(ORIGIN.0, Space::Gaussians, &[(ORIGIN.1, 1)], rows as usize, |_| {})?;
+        let origin = |row: u32| if row < known { row } else { NEW };
+        (0..rows).for_each(|row| own[key].set(row as usize, 0, origin(row) as f32));
+        own.info_mut(key).trainable = false;
+        Ok(own)
+    }
+
     /// The active Gaussians in a layer that learns, moved on as they moved if that fits the images better, and all
     /// others in one that does not.
-    fn split(&self, active: &[u32], plan: &TrainContext, exposure: Option<&Exposure>) -> Result<Scene<f32>> {
+    fn split(&self, active: &[u32], extent: f64, exposure: Option<&Exposure>) -> Result<Scene<f32>> {
         let (all, coefficients) = (&self.history.layer.params, self.history.coefficients());
         let mut is_active = vec![false; all.len()];
         active.iter().for_each(|&r| is_active[r as usize] = true);
         let rest: Vec<u32> = (0..all.len() as u32).filter(|&r| !is_active[r as usize]).collect();
-        let mut own = gathered(&[(all, active)], coefficients);
-        let key = own.entry(ORIGIN.0, Space::Gaussians, &[(ORIGIN.1, 1)], active.len(), |_| {})?;
-        (0..active.len()).for_each(|row| own[key].set(row, 0, row as f32));
-        own.info_mut(key).trainable = false;
+        let own = gathered(&[(all, active)], coefficients);
         let mut others = gathered(&[(all, &rest)], coefficients);
         for key in others.keys().collect::<Vec<_>>() {
             others.info_mut(key).trainable = false;
@@ -141,7 +182,7 @@ impl Fit<'_> {
             layers.push(splat4d::layers::Layer { name: "unchanged".into(), ..still(others) });
         }
         let there = Scene { layers, ..self.shell.clone() };
-        let cap = (VELOCITY_CAP * plan.extent) as f32;
+        let cap = (VELOCITY_CAP * extent) as f32;
         let moved: Vec<_> = active.iter().map(|&r| self.history.extrapolated(r as usize, cap)).enumerate().collect();
         if moved.iter().all(|(_, pose)| pose.is_none()) {
             return Ok(there);

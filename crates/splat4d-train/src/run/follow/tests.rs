@@ -5,7 +5,9 @@ use super::history::still;
 use super::record::NEW;
 use super::*;
 use crate::run::tests::{Place, recipe};
+use crate::step::tests::Made;
 use splat4d::format::playback::Primitive;
+use splat4d::math::se3::{norm, sub};
 use splat4d::scene::params::OPACITY;
 use splat4d::scene::{GEOMETRY, Params};
 
@@ -18,7 +20,11 @@ struct Recorded {
 
 impl Recorded {
     fn new(changes: &[&str]) -> Self {
-        let (whole, folder) = (Place::new(), tempfile::tempdir().unwrap());
+        Self::of(Place::new(), changes)
+    }
+
+    fn of(whole: Place, changes: &[&str]) -> Self {
+        let folder = tempfile::tempdir().unwrap();
         std::fs::copy(whole.source().join("capture.json"), folder.path().join("capture.json")).unwrap();
         let short = ["follow.first_steps=30", "follow.frame_steps=8", "follow.changed=0.001", "follow.share=0.05"];
         let recipe = recipe(&[&short[..], changes].concat());
@@ -234,6 +240,30 @@ fn frames_are_learnt_as_they_arrive_and_a_stopped_run_continues_bit_for_bit() {
     let (recipe, opened) = crate::run::open_run(&capture.whole.run("again")).unwrap();
     assert_eq!((recipe.capture.max_frames, opened.train.len()), (3, 9));
     assert_eq!(Following::request(&capture.whole.run("again")).unwrap().1, capture.recipe);
+}
+
+#[test]
+fn what_appears_gets_gaussians_where_it_is() {
+    // In the first frame the ball is too far away to be seen.
+    let capture = Recorded::of(Place::filmed(6, &[10_000, 1, 1]), &[]);
+    let mut following = capture.begin("run");
+    let mut known = [0; 3];
+    for frame in 0..3 {
+        capture.record(frame, 0..6);
+        known[frame] = fit(&mut following).gaussians;
+    }
+    let record = |frame: usize| Record::read(&capture.whole.run("run").join(FOLDER), frame).unwrap();
+    let new = |record: &Record| -> Vec<[f32; 3]> {
+        let rows = record.origin.iter().enumerate().filter(|(_, o)| **o == NEW).map(|(row, _)| row);
+        rows.map(|row| record.params[GEOMETRY].read::<3>(row, 0)).collect()
+    };
+    let made = Made::new(6, 3, 8);
+    let center = made.object_at(made.time_of(1));
+    let points = new(&record(1));
+    let near = points.iter().filter(|x| norm(sub(x.map(f64::from), center)) < 1.6 * Made::RADIUS).count();
+    assert!(near >= 20 && 10 * near >= 8 * points.len(), "{near} of {} are where it appeared", points.len());
+    assert!(known[1] > known[0] && 4 * known[2] <= 5 * 130, "{known:?}: up to a quarter more than densify.max_cap");
+    assert!(new(&record(2)).len() < points.len() / 2, "then it is there: {}", new(&record(2)).len());
 }
 
 #[test]
