@@ -32,7 +32,7 @@ use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::follow::Following;
-use splat4d_train::run::{Stopwatch, capture_options, corrected};
+use splat4d_train::run::{Stopwatch, corrected, run_options};
 use splat4d_train::{features, labels};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -520,7 +520,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
         return Ok(());
     }
     // A run that does not train on flow has left the files out.
-    let mut whole = Capture::open(&capture.root, &capture_options(recipe)?)?;
+    let mut whole = Capture::open(&capture.root, &run_options(run, recipe)?)?;
     corrected::apply(&mut whole, run)?;
     whole.held.retain(|i| capture.held.contains(i));
     whole.train.retain(|i| capture.train.contains(i));

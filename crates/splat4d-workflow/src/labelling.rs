@@ -11,11 +11,11 @@ use serde_json::json;
 use splat4d::Result;
 use splat4d::format;
 use splat4d::layers::Scene;
-use splat4d_train::capture::{Capture, CaptureOptions, Frame};
+use splat4d_train::capture::{Capture, Frame};
 use splat4d_train::features;
 use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
 use splat4d_train::output::OutputFolder;
-use splat4d_train::run::{capture_options, corrected};
+use splat4d_train::run::{corrected, run_options};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -67,7 +67,7 @@ pub fn learn_into(
     not_empty(&scene, run)?;
     let (mut capture, recipe) = opened.open_capture()?;
     if let Some(from) = from {
-        capture = Capture::open(from, &CaptureOptions { frames: Vec::new(), ..capture_options(&recipe)? })?;
+        capture = Capture::open(from, &run_options(run, &recipe)?)?;
     }
     corrected::apply(&mut capture, run)?;
     let there = |which: fn(&Frame) -> bool| capture.train.iter().any(|&i| which(&capture.frames[i]));

@@ -15,7 +15,7 @@ use splat4d_train::path_text::{in_command, of_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::follow::Following;
-use splat4d_train::run::{capture_options, checkpoint, recorded_elsewhere};
+use splat4d_train::run::{checkpoint, recorded_elsewhere, run_options};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -232,7 +232,7 @@ impl Run {
         let opened = || {
             let (root, recipe) = (self.capture()?, self.recipe().ok()?);
             // Also masks and maps that the recipe does not use.
-            Capture::open(&root, &capture_options(&recipe).ok()?).ok()
+            Capture::open(&root, &run_options(&self.path, &recipe).ok()?).ok()
         };
         // A capture that can no longer be opened still has the images that the run was trained on.
         let mut elsewhere = recorded_elsewhere(&self.info);

@@ -243,6 +243,9 @@ pub struct CaptureOptions {
     /// Only images with these frame numbers are listed, so that memory does not grow with the capture; empty: all. What
     /// they are for (training, held out) is as in the whole capture.
     pub frames: Vec<Range<usize>>,
+    /// Whether frames that are not in `frames` may be missing before the last of these, as in a capture that is still
+    /// recorded; else a camera without a stated number of frames ends where an image is missing.
+    pub gaps: bool,
     /// Known properties of the lenses, from another part of the capture; else images are examined.
     pub lenses: Lenses,
     /// Readout time of cameras that state none, seconds from the first row to the last; `None`: readout times are
@@ -293,6 +296,7 @@ impl Default for CaptureOptions {
             unregistered: Unregistered::Auto,
             max_missing: MAX_MISSING,
             frames: Vec::new(),
+            gaps: false,
             lenses: Lenses::default(),
             readout: Some(0.0),
             exposure: 0.0,

@@ -362,10 +362,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     };
     let (first, mut there, mut missing) = (frames.len(), 0, 0);
     let most = if let Files::List(names) = &images { names.len() } else { usize::MAX };
-    let alone = match &context.options.frames[..] {
-        [frame] if frame.len() == 1 => Some(frame.start),
-        _ => None,
-    };
+    let needed = if context.options.gaps { context.options.frames.iter().map(|f| f.end).max().unwrap_or(0) } else { 0 };
     for index in 0..count.unwrap_or(most) {
         let listed = !context.in_part || context.options.lists(index);
         let ends = count.is_none() && matches!(images, Files::Pattern { .. }) && index > 0;
@@ -376,12 +373,11 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         let Some(name) = images.text(start, index) else { break };
         let found = context.lookup.image(&bases, &name).map_err(|e| node.at(e))?;
         if found.is_none() {
-            // A frame that is requested alone is read even if an earlier one is missing: the capture may still grow.
-            if ends && !listed && alone.is_some_and(|last| index < last) {
-                continue;
-            }
-            if ends {
-                break;
+            // Only frames that are needed are missed before the last of them.
+            match (ends, index < needed) {
+                (true, false) => break,
+                (true, true) if !listed => continue,
+                _ => {}
             }
             missing += 1;
             // A number of frames that is a slip must not be counted through.

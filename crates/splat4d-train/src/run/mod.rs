@@ -36,9 +36,9 @@ pub use memory::{available_memory, memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;
 pub(crate) use open::training_frames;
-pub use open::{capture_options, open_capture, open_frames, plan};
 pub(crate) use open::{learnable, scale};
+pub use open::{open_capture, open_frames, plan};
 pub use points::with_found;
 pub(crate) use refine::{Refine, refine};
 pub use session::{Outcome, OwnLoss, TrainOptions};
-pub use start::{Forecast, forecast, open_run, resume, resume_with, train};
+pub use start::{Forecast, forecast, open_run, resume, resume_with, run_options, train};

@@ -29,7 +29,7 @@ const LOOKED_AT: usize = 16;
 const SINGLE_PLACE: f64 = 1e-6;
 
 /// The options with which a recipe opens its capture.
-pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
+pub(crate) fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     Ok(CaptureOptions {
         downscale: recipe.capture.downscale,
         hold_out: recipe.capture.hold_out.clone(),
@@ -59,7 +59,11 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
 /// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]).
 /// `lenses`: what another part of it found ([`Capture::lenses`]).
 pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lenses: &Lenses) -> Result<Capture> {
-    let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };
+    open_with(path, recipe, CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? })
+}
+
+/// The same with options of reading that may differ from the recipe's.
+pub(super) fn open_with(path: &Path, recipe: &Recipe, options: CaptureOptions) -> Result<Capture> {
     let mut capture = Capture::open(path, &options)?;
     if recipe.loss.flow == 0.0 {
         // It is not used: it need not be decoded.

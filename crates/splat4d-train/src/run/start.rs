@@ -6,16 +6,17 @@ use super::checkpoint;
 use super::count::settled;
 use super::far;
 use super::flows;
+use super::follow::Following;
 use super::identity::identity;
 use super::info::{read_info, read_text};
 use super::measured;
 use super::memory::memory_estimate;
 use super::minutes::Timing;
-use super::open::{OpenCapture, check_flow, open_capture};
+use super::open::{OpenCapture, capture_options, check_flow, open_with};
 use super::points;
 use super::priors;
 use super::session::{Outcome, Session, TrainOptions};
-use crate::capture::Capture;
+use crate::capture::{Capture, CaptureOptions};
 use crate::event::Event;
 use crate::init::Seeds;
 use crate::path_text::of_text;
@@ -261,6 +262,13 @@ fn same_device(device: Device, info: &Value) -> Device {
     if device == Device::Auto && on_cpu { Device::Cpu } else { device }
 }
 
+/// The options with which a run opens its capture. `recipe`: that of the run. A followed run needs only the images of the
+/// frames that it took, as its capture may have ended early or may still be recorded.
+pub fn run_options(run: &Path, recipe: &Recipe) -> Result<CaptureOptions> {
+    let frames = Following::taken(run);
+    Ok(CaptureOptions { gaps: !frames.is_empty(), frames, ..capture_options(recipe)? })
+}
+
 /// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture is
 /// missing.
 pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
@@ -270,7 +278,7 @@ pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let path = info["capture"].as_str().ok_or_else(|| {
         Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
     })?;
-    let mut capture = open_capture(&of_text(path), &recipe)
+    let mut capture = open_with(&of_text(path), &recipe, run_options(run, &recipe)?)
         .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
     if capture.offset != [0.0; 3]
         && let Some(offset) = offset_of_scene(run)?

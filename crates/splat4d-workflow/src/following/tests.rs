@@ -60,6 +60,13 @@ impl Take {
         }
     }
 
+    /// Writes a number of frames into `capture.json`.
+    fn state_frames(&self, frames: usize) {
+        let file = self.capture().join("capture.json");
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, text.replacen('{', &format!(r#"{{"frames": {frames}, "#), 1)).unwrap();
+    }
+
     fn end(&self) {
         std::fs::write(self.capture().join("capture.end"), "").unwrap();
     }
@@ -174,7 +181,8 @@ fn frames_that_never_come_are_left_out_or_reported() {
     let error = take.follow(0.3, &stop, &ignore).unwrap_err().to_string();
     assert!(error.contains("no frame of the capture is complete within 0.3 s") && error.contains("cam00"), "{error}");
     assert!(!take.run().join("frames").exists(), "nothing is left to continue");
-    // A camera misses a frame, and the last frame is incomplete.
+    // A camera misses a frame, the last frame is incomplete, and the capture states more frames.
+    take.state_frames(30);
     take.record(0, 0..CAMERAS);
     take.record(1, 0..CAMERAS - 1);
     take.record(2, 0..CAMERAS);
@@ -192,6 +200,16 @@ fn frames_that_never_come_are_left_out_or_reported() {
     assert!(warned[1].contains("frame 3") && warned[1].contains("cam02"), "{warned:?}");
     assert_eq!(take.lines().len(), 2);
     assert_eq!(take.index().meta.clip[1], 2.0 / take.index().meta.fps);
+    // The frames that were taken are scored.
+    let scored = || evaluating::evaluate(&take.run(), &Default::default(), &stop, &ignore);
+    assert!(scored().unwrap().held("PSNR").is_some_and(|db| db > 8.0));
+    let times: Vec<Option<f64>> = Run::open(&take.run()).unwrap().views.iter().map(|view| view.time).collect();
+    assert_eq!(times, [Some(0.0), Some(take.index().meta.clip[1])]);
+    for camera in 2..CAMERAS {
+        std::fs::remove_file(take.capture().join(format!("images/cam{camera:02}/0002.jpg"))).unwrap();
+    }
+    let error = scored().unwrap_err().to_string();
+    assert!(error.contains("4 of 12 images are missing: images/cam02/0002.jpg"), "{error}");
     // Options that make no sense.
     let options = TrainingOptions { minutes: Some(1.0), ..take.options() };
     let error = follow(&take.capture(), &Take::recipe(1.0), &options, &stop, &ignore).unwrap_err();

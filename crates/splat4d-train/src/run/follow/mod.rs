@@ -22,7 +22,7 @@ pub use arrival::Arrival;
 use super::checkpoint::write_atomically;
 use super::identity::{fingerprint, recipe_print};
 use super::info::{ELSEWHERE, elsewhere, read_text};
-use super::open::{OpenCapture, capture_options, open_frames};
+use super::open::{OpenCapture, capture_options, open_with};
 use super::points;
 use crate::capture::{Capture, CaptureOptions, Lenses, growing_root};
 use crate::event::{Event, FollowedFrame};
@@ -153,6 +153,12 @@ impl Following {
         Ok((capture, recipe))
     }
 
+    /// The frames that a run took; empty: no frame is done, or it is a run of another kind.
+    pub(crate) fn taken(run: &Path) -> Vec<Range<usize>> {
+        let numbers = if Self::is(run) { record::list(&run.join(FOLDER)) } else { Vec::new() };
+        numbers.chunk_by(|a, b| a + 1 == *b).map(|part| part[0]..part[part.len() - 1] + 1).collect()
+    }
+
     fn folder(&self) -> PathBuf {
         self.run.join(FOLDER)
     }
@@ -184,9 +190,9 @@ impl Following {
     /// One frame of the capture.
     fn capture(&self, frame: usize) -> Result<Arc<Capture>> {
         let recipe = self.recipe.clone().with(|r| (r.capture.first_frame, r.capture.max_frames) = (frame, 1));
-        let one = frame..frame + 1;
-        let capture = open_frames(&self.root, &recipe, vec![one], &self.lenses)?;
-        Ok(Arc::new(capture))
+        let (frames, lenses) = (std::iter::once(frame..frame + 1).collect(), self.lenses.clone());
+        let options = CaptureOptions { frames, lenses, gaps: true, ..self.options.clone() };
+        Ok(Arc::new(open_with(&self.root, &recipe, options)?))
     }
 
     /// Learns the next frame, which is complete. `None`: a stop was requested, and the frame is not part of the run.

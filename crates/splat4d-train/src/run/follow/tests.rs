@@ -267,6 +267,39 @@ fn what_appears_gets_gaussians_where_it_is() {
 }
 
 #[test]
+fn a_run_needs_the_images_of_the_frames_that_it_took_alone() {
+    let capture = Recorded::new(&[]);
+    let file = capture.folder.path().join("capture.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let mut following = capture.begin("run");
+    capture.record(0, 0..4);
+    fit(&mut following);
+    // A camera misses a frame; the recording ends before the last one is complete.
+    capture.record(1, 0..3);
+    following.skip();
+    capture.record(2, 0..4);
+    fit(&mut following);
+    std::fs::copy(capture.image(0, 2), capture.image(0, 3)).unwrap();
+    following.write_info(1.0, true).unwrap();
+    let run = capture.whole.run("run");
+    let opened = || crate::run::open_run(&run);
+    let listed = text.replace("images/2/%04d.png\"", "images/2/%04d.png\", \"frames\": 3");
+    for text in [text.clone(), text.replacen('{', r#"{"frames": 1000, "#, 1), listed] {
+        std::fs::write(&file, text).unwrap();
+        let read = opened().unwrap().1;
+        assert_eq!(read.times(), [0.0, 0.2]);
+        assert_eq!((read.train.len(), read.held.len(), read.account), (6, 2, Vec::new()));
+    }
+    // Images of frames that it took are missed: one is reported, many are an error.
+    std::fs::remove_file(capture.image(1, 2)).unwrap();
+    let reported = opened().unwrap().1.account;
+    assert!(reported.iter().any(|r| r.what.contains("1 of 8 images are missing: images/1/0002.png")), "{reported:?}");
+    std::fs::remove_file(capture.image(2, 2)).unwrap();
+    let error = opened().unwrap_err().to_string();
+    assert!(error.contains("2 of 8 images are missing: images/1/0002.png, images/2/0002.png"), "{error}");
+}
+
+#[test]
 fn static_frames_change_next_to_nothing() {
     // Nothing exceeds such an error.
     let capture = Recorded::new(&["follow.changed=2"]);
