@@ -231,4 +231,4 @@ fn finite(value: f64, place: impl Fn() -> String) -> Result<()> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

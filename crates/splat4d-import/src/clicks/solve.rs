@@ -9,7 +9,7 @@ use crate::sfm::lens::{Lens, unit};
 use crate::sfm::resection::{Known, place};
 use crate::sfm::two_view::{Pair, depths, essential_of, five, motions, polish_motion, sampson};
 use splat4d::math::align::turn_between;
-use splat4d::math::se3::{add, dot, mat_vec, norm, normalize, scale, sub, transpose};
+use splat4d::math::se3::{add, dot, norm, normalize, scale, sub};
 use splat4d::math::sym3::eigen;
 use splat4d::math::{Rng, Se3, mat3, median};
 
@@ -402,27 +402,17 @@ impl Problem<'_> {
     /// Finds points that two placed cameras show and that are not known yet; forgets those that are behind a camera.
     fn triangulate(&self, rig: &mut Rig) {
         for p in 0..self.points.len() {
-            let (mut a, mut b, mut count) = ([[0.0; 3]; 3], [0.0; 3], 0);
-            let mut poses = Vec::new();
+            let (mut lines, mut poses) = (Vec::new(), Vec::new());
             for click in self.clicks.iter().filter(|c| c.point == p) {
                 let Some(pose) = rig.poses[click.camera] else { continue };
-                let ahead = normalize(mat_vec(&transpose(&pose.rotation), rig.lenses[click.camera].ray(click.pixel)));
-                let center = pose.inverse().translation;
-                for r in 0..3 {
-                    for k in 0..3 {
-                        let m = f64::from(u8::from(r == k)) - ahead[r] * ahead[k];
-                        a[r][k] += m;
-                        b[r] += m * center[k];
-                    }
-                }
-                count += 1;
+                lines.push(rig.lenses[click.camera].line(&pose, click.pixel));
                 poses.push(pose);
             }
             let before = |x: &[f64; 3]| poses.iter().all(|pose| pose.apply(*x)[2] > 0.0);
-            if count < 2 {
+            if lines.len() < 2 {
                 rig.points[p] = None;
             } else if rig.points[p].filter(before).is_none() {
-                rig.points[p] = mat3::solve(a, b).filter(before);
+                rig.points[p] = mat3::nearest_to_lines(lines).filter(before);
             }
         }
     }

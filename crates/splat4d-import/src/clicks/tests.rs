@@ -1,3 +1,4 @@
+pub(crate) use super::people::tests::Scene;
 use super::*;
 use crate::sfm::algebra::rotation;
 use crate::sfm::lens::Lens;
@@ -7,19 +8,19 @@ use splat4d::math::se3::mat_mul;
 use splat4d::math::{Rng, Se3};
 
 /// Seconds between frames.
-pub(super) const FRAME: f64 = 1.0 / 30.0;
+pub(crate) const FRAME: f64 = 1.0 / 30.0;
 
 /// Four cameras at right angles, about four metres from what they show.
-pub(super) struct Studio {
-    pub(super) poses: Vec<Se3>,
-    pub(super) lenses: Vec<Lens>,
+pub(crate) struct Studio {
+    pub(crate) poses: Vec<Se3>,
+    pub(crate) lenses: Vec<Lens>,
     pub(super) cameras: Vec<Camera>,
     /// Seconds that are added to each clock.
-    pub(super) offsets: Vec<f64>,
+    pub(crate) offsets: Vec<f64>,
 }
 
 impl Studio {
-    pub(super) fn new(seed: u64) -> Self {
+    pub(crate) fn new(seed: u64) -> Self {
         let rng = Rng::new(seed, "studio", 0);
         let pose = |c: usize| {
             let angle = std::f64::consts::FRAC_PI_2 * c as f64 + 0.1 * rng.normal(c as u64);

@@ -28,8 +28,6 @@ const OLD: &str = "import/points.old.json";
 /// Median distance of clicks from their points above which a rig is refused, of the larger side: 10 px of 1920. Errors
 /// of clicks are a fifth of it, wrong corners ten times as large.
 const MOST_ERROR: f64 = 0.005;
-/// Widths and heights of images whose quotients differ by more are parts of different images.
-const SHAPE: f64 = 0.01;
 /// Positions along the ray of a click at which its epipolar line is computed, and the nearest, of the rig's unit.
 const STEPS: usize = 32;
 const NEAREST: f64 = 0.05;
@@ -84,10 +82,7 @@ pub(super) fn placed(
     kept: &[bool],
     report: &mut Report,
 ) -> Result<Placed> {
-    if known.iter().flatten().any(|k| k.pose.is_some()) {
-        return Err(Error::input("poses are given in two ways: by a calibration and by clicked points")
-            .remedy("Leave --points or --calibration out, or give a calibration of lenses alone."));
-    }
+    given::without_poses(known, "clicked points", "--points")?;
     let rig = Rig::new(clicks, pictures, known, clock, kept)?;
     let found = rig.solve();
     let missing: Vec<String> = found
@@ -120,10 +115,7 @@ pub(super) fn placed(
     for (c, own) in known.iter_mut().enumerate() {
         let (pose, lens) = found.cameras[c].as_ref().expect("all have a pose");
         let pose = Se3 { rotation: pose.rotation, translation: scale(pose.translation, by.unwrap_or(1.0)) };
-        let [width, height] = pictures[c].size;
-        let camera = lens.camera(pose, width, height);
-        let (intrinsics, lens) = own.map_or((camera.intrinsics, camera.lens), |k| (k.intrinsics, k.lens));
-        *own = Some(Known { intrinsics, lens, pose: Some(pose) });
+        given::place(own, pose, *lens, pictures[c].size);
     }
     let count: usize = clicks.points.iter().map(|p| p.clicks.len()).sum();
     report.guesses.push(format!(
@@ -160,18 +152,9 @@ impl<'a> Rig<'a> {
         let names: Vec<&str> = pictures.iter().map(|p| p.name.as_str()).collect();
         let mut factors = Vec::with_capacity(pictures.len());
         for p in pictures {
-            let [width, height] = clicks.cameras.get(&p.name).copied().unwrap_or(p.size);
-            let by = [p.size[0] as f64 / width.max(1) as f64, p.size[1] as f64 / height.max(1) as f64];
-            if (by[0] / by[1] - 1.0).abs() > SHAPE {
-                return Err(Error::input(format!(
-                    "points were clicked in images of {width}x{height} pixels, which have another shape than the stored \
-                     ones of {}x{}",
-                    p.size[0], p.size[1]
-                ))
-                .at(format!("camera {}", p.name))
-                .remedy("Import with the same --crop, or click the points again with --assist."));
-            }
-            factors.push(by);
+            let size = clicks.cameras.get(&p.name).copied().unwrap_or(p.size);
+            let remedy = "Import with the same --crop, or click the points again with --assist.";
+            factors.push(given::factors("points were clicked", size, p, remedy)?);
         }
         let straight: Vec<Option<Straight>> =
             known.iter().zip(pictures).map(|(k, p)| k.map(|k| k.straight(p.size, 1.0))).collect();

@@ -3,9 +3,10 @@
 use super::{Camera, Request};
 use crate::calibration::{self, Calibrated, Calibration, Shape, Unit, Video};
 use crate::corrections::Corrections;
-use crate::sfm::lens::Known;
+use crate::sfm::lens::{Known, Lens};
 use crate::write::Pictures;
 use crate::{Error, Result};
+use splat4d::math::Se3;
 use splat4d::scene::Planes;
 use splat4d_train::capture::{PointCloud, Rgb8};
 use std::path::Path;
@@ -73,6 +74,40 @@ impl Given {
 
 /// Images of a camera in which bars are searched for.
 const SAMPLED: usize = 3;
+/// Widths and heights of images whose quotients differ by more are parts of different images.
+const SHAPE: f64 = 0.01;
+
+/// Refuses a calibration with poses where something else, which an option gives, determines them too.
+pub(super) fn without_poses(known: &[Option<Known>], other: &str, option: &str) -> Result<()> {
+    if known.iter().flatten().all(|k| k.pose.is_none()) {
+        return Ok(());
+    }
+    Err(Error::input(format!("poses are given in two ways: by a calibration and by {other}"))
+        .remedy(format!("Leave {option} or --calibration out, or give a calibration of lenses alone.")))
+}
+
+/// Pixels of stored images for one of the images (of this size) in which something was found.
+///
+/// Errors: images of another shape, with this remedy.
+pub(super) fn factors(found: &str, size: [usize; 2], p: &Pictures, remedy: &str) -> Result<[f64; 2]> {
+    let by: [f64; 2] = std::array::from_fn(|a| p.size[a] as f64 / size[a].max(1) as f64);
+    if (by[0] / by[1] - 1.0).abs() <= SHAPE {
+        return Ok(by);
+    }
+    Err(Error::input(format!(
+        "{found} in images of {}x{} pixels, which have another shape than the stored ones of {}x{}",
+        size[0], size[1], p.size[0], p.size[1]
+    ))
+    .at(format!("camera {}", p.name))
+    .remedy(remedy))
+}
+
+/// Puts the pose of a camera among the known ones; the lens only where none is known.
+pub(super) fn place(own: &mut Option<Known>, pose: Se3, lens: Lens, [width, height]: [usize; 2]) {
+    let camera = lens.camera(pose, width, height);
+    let (intrinsics, lens) = own.map_or((camera.intrinsics, camera.lens), |k| (k.intrinsics, k.lens));
+    *own = Some(Known { intrinsics, lens, pose: Some(pose) });
+}
 
 /// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority. Sentences
 /// about calibrations that had to be corrected for them join the images' warnings.

@@ -1,18 +1,16 @@
 //! The rig that keypoints of people give.
 
 use super::assist::Placed;
+use super::given;
 use super::report::Report;
 use super::world::Origin;
+use crate::Result;
 use crate::clicks::{self, Frames, calibrate, read_keypoints};
 use crate::sfm::known::Straight;
 use crate::sfm::lens::Known;
 use crate::sync::graph;
 use crate::write::Pictures;
-use crate::{Error, Result};
 use std::path::Path;
-
-/// Widths and heights of images whose quotients differ by more are parts of different images.
-const SHAPE: f64 = 0.01;
 
 /// Finds the rig by keypoints of people in a folder, and puts lenses and poses among the known ones.
 ///
@@ -27,24 +25,13 @@ pub(super) fn placed(
     kept: &[bool],
     report: &mut Report,
 ) -> Result<Placed> {
-    if known.iter().flatten().any(|k| k.pose.is_some()) {
-        return Err(Error::input("poses are given in two ways: by a calibration and by keypoints of people")
-            .remedy("Leave --keypoints or --calibration out, or give a calibration of lenses alone."));
-    }
+    given::without_poses(known, "keypoints of people", "--keypoints")?;
     let names: Vec<&str> = pictures.iter().map(|p| p.name.as_str()).collect();
     let mut frames = read_keypoints(folder, &names)?;
     let mut rig = Vec::with_capacity(names.len());
     for (c, p) in pictures.iter().enumerate() {
         let info = cameras[c].source.info();
-        let by: [f64; 2] = std::array::from_fn(|a| p.size[a] as f64 / info.size[a].max(1) as f64);
-        if (by[0] / by[1] - 1.0).abs() > SHAPE {
-            return Err(Error::input(format!(
-                "people were detected in images of {}x{} pixels, which have another shape than the stored ones of {}x{}",
-                info.size[0], info.size[1], p.size[0], p.size[1]
-            ))
-            .at(format!("camera {}", p.name))
-            .remedy("Import without --crop."));
-        }
+        let by = given::factors("people were detected", info.size, p, "Import without --crop.")?;
         let straight = known[c].map(|k| k.straight(p.size, 1.0));
         moved(&mut frames[c], by, straight.as_ref());
         let rate = info.average_rate.or(info.nominal_rate).filter(|rate| *rate > 0.0);
@@ -59,10 +46,7 @@ pub(super) fn placed(
     let found = calibrate(&names, &rig, &frames).map_err(|e| e.at(folder.display()))?;
     for (c, own) in known.iter_mut().enumerate() {
         let (pose, lens) = found.cameras[c];
-        let [width, height] = pictures[c].size;
-        let camera = lens.camera(pose, width, height);
-        let (intrinsics, lens) = own.map_or((camera.intrinsics, camera.lens), |k| (k.intrinsics, k.lens));
-        *own = Some(Known { intrinsics, lens, pose: Some(pose) });
+        given::place(own, pose, lens, pictures[c].size);
     }
     report.guesses.push(format!(
         "Poses and focal lengths are those of keypoints of {} people: {} positions in images, {:.1} px (of 1920) off at the \
@@ -83,3 +67,6 @@ fn moved(frames: &mut Frames, by: [f64; 2], straight: Option<&Straight>) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

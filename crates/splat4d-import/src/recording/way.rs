@@ -107,17 +107,7 @@ fn own_sigma(e: &Evidence) -> f64 {
 /// The point nearest to the axes of all cameras, and their median distance from it.
 fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)> {
     let known: Vec<_> = places.iter().flatten().collect();
-    let (mut a, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
-    for (center, ahead) in &known {
-        for r in 0..3 {
-            for k in 0..3 {
-                let m = f64::from(u8::from(r == k)) - ahead[r] * ahead[k];
-                a[r][k] += m;
-                b[r] += m * center[k];
-            }
-        }
-    }
-    let middle = mat3::solve(a, b)?;
+    let middle = mat3::nearest_to_lines(known.iter().copied().copied())?;
     let mut distances: Vec<f64> = known.iter().map(|(center, _)| norm(sub(*center, middle))).collect();
     distances.sort_by(f64::total_cmp);
     distances.get(distances.len() / 2).map(|d| (middle, *d))

@@ -1,7 +1,7 @@
 //! How a camera makes pixels of positions: square pixels, one radial coefficient, a principal point.
 
 use splat4d::math::Se3;
-use splat4d::math::se3::mat_vec;
+use splat4d::math::se3::{mat_vec, normalize, transpose};
 use splat4d::scene::{Camera, Intrinsics, Lens as SceneLens};
 
 /// Pixels across for which tolerances are stated.
@@ -92,6 +92,11 @@ impl Lens {
             }
         }
         [bent[0] * r / radius, bent[1] * r / radius, 1.0]
+    }
+
+    /// The line on which a pixel of a posed camera lies: the camera's centre, and the unit direction (world axes).
+    pub(crate) fn line(&self, pose: &Se3, pixel: [f64; 2]) -> ([f64; 3], [f64; 3]) {
+        (pose.inverse().translation, normalize(mat_vec(&transpose(&pose.rotation), self.ray(pixel))))
     }
 
     /// Undistorted position of a pixel, for a pinhole camera of the same focal length.

@@ -2,7 +2,7 @@
 
 use super::account::{Severity, first_names};
 use super::{Aspect, Capture, Frame};
-use splat4d::math::mat3::solve;
+use splat4d::math::mat3::nearest_to_lines;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Something about a capture that will show in the result.
@@ -271,21 +271,11 @@ fn finding(severity: Severity, what: String, remedy: &str) -> Finding {
 
 /// The point nearest to all optical axes (least squares); the cameras' centroid moved ahead if they are parallel.
 fn look_at(views: &[&Frame]) -> [f64; 3] {
-    let mut matrix = [[0.0f64; 3]; 3];
-    let mut right = [0.0f64; 3];
     let mut center = [0.0; 3];
-    for frame in views {
-        let (c, d) = (frame.view.center(), frame.view.forward());
-        for i in 0..3 {
-            center[i] += c[i] / views.len() as f64;
-            for j in 0..3 {
-                let m = f64::from(u8::from(i == j)) - d[i] * d[j];
-                matrix[i][j] += m;
-                right[i] += m * c[j];
-            }
-        }
+    for c in views.iter().map(|frame| frame.view.center()) {
+        (0..3).for_each(|i| center[i] += c[i] / views.len() as f64);
     }
-    solve(matrix, right).unwrap_or_else(|| {
+    nearest_to_lines(views.iter().map(|f| (f.view.center(), f.view.forward()))).unwrap_or_else(|| {
         let ahead = views.first().map_or([0.0, 0.0, 1.0], |f| f.view.forward());
         let reach = views.iter().map(|f| norm(sub(f.view.center(), center))).fold(1.0, f64::max);
         std::array::from_fn(|k| center[k] + 3.0 * reach * ahead[k])

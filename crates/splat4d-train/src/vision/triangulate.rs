@@ -1,6 +1,6 @@
 //! From pixels of several cameras to points of the world.
 
-use splat4d::math::mat3::solve;
+use splat4d::math::mat3::{nearest_to_lines, solve};
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, normalize, sub, transpose};
 use splat4d::scene::Camera;
 
@@ -81,22 +81,13 @@ const STEPS: usize = 3;
 /// The point that several cameras see: the point nearest to their rays, then least squares of the reprojection errors.
 /// Nothing where the rays are parallel or meet behind a camera.
 pub fn triangulate(sights: &[PixelObservation<'_>]) -> Option<[f64; 3]> {
-    let mut a = [[0.0; 3]; 3];
-    let mut b = [0.0; 3];
     // About the first camera, for the sake of digits far from the world's origin.
     let origin = sights.first()?.camera.center();
-    for s in sights {
-        let d = normalize(mat_vec(&transpose(&s.camera.cam_from_world.rotation), ray(s.camera, s.pixel)));
-        let c = sub(s.camera.center(), origin);
-        for r in 0..3 {
-            for k in 0..3 {
-                let m = f64::from(u8::from(r == k)) - d[r] * d[k];
-                a[r][k] += m;
-                b[r] += m * c[k];
-            }
-        }
-    }
-    let start = solve(a, b)?;
+    let line = |s: &PixelObservation<'_>| {
+        let ahead = normalize(mat_vec(&transpose(&s.camera.cam_from_world.rotation), ray(s.camera, s.pixel)));
+        (sub(s.camera.center(), origin), ahead)
+    };
+    let start = nearest_to_lines(sights.iter().map(line))?;
     let mut x: [f64; 3] = std::array::from_fn(|k| start[k] + origin[k]);
     for _ in 0..STEPS {
         let mut h = [[0.0; 3]; 3];

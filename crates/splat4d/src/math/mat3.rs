@@ -28,6 +28,22 @@ pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
     ])
 }
 
+/// The point nearest to several lines (least squares), each given by one of its points and its unit direction: the solution of
+/// Σ (I − d dᵀ) x = Σ (I − d dᵀ) c. `None` where all are nearly parallel.
+pub fn nearest_to_lines(lines: impl IntoIterator<Item = ([f64; 3], [f64; 3])>) -> Option<[f64; 3]> {
+    let (mut a, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
+    for (c, d) in lines {
+        for i in 0..3 {
+            for j in 0..3 {
+                let m = f64::from(u8::from(i == j)) - d[i] * d[j];
+                a[i][j] += m;
+                b[i] += m * c[j];
+            }
+        }
+    }
+    solve(a, b)
+}
+
 /// The rotation R (det +1, never a reflection) that maximises Σ_ij R_ij cov_ij, so that for cov = Σ w a bᵀ it minimises
 /// Σ w ‖a − R b‖² (the orthogonal Procrustes or Wahba problem).
 ///
@@ -73,6 +89,7 @@ fn top_eigenvector(a: [[f64; 4]; 4]) -> [f64; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::se3::{add, normalize, scale, sub};
     use crate::math::{Rng, Se3};
 
     fn random(purpose: &str, i: u64) -> [[f64; 3]; 3] {
@@ -92,6 +109,23 @@ mod tests {
     fn is_rotation(r: [[f64; 3]; 3]) -> bool {
         let pose = Se3 { rotation: r, translation: [0.0; 3] };
         pose.orthogonality_error() < 1e-12 && (pose.det() - 1.0).abs() < 1e-12
+    }
+
+    #[test]
+    fn no_point_is_nearer_to_lines() {
+        let lines: Vec<_> = (0..5).map(|i| (random("lines", i)[0], normalize(random("lines", i)[1]))).collect();
+        let off =
+            |x: [f64; 3]| -> f64 { lines.iter().map(|&(c, d)| dot(cross(sub(x, c), d), cross(sub(x, c), d))).sum() };
+        let x = nearest_to_lines(lines.iter().copied()).unwrap();
+        for k in 0..6 {
+            let mut near = x;
+            near[k / 2] += if k % 2 == 0 { 1e-3 } else { -1e-3 };
+            assert!(off(near) > off(x), "{near:?} is nearer than {x:?}");
+        }
+        let through = [0.3, -0.2, 0.9];
+        let met = nearest_to_lines(lines.iter().map(|&(_, d)| (add(through, scale(d, 2.0)), d))).unwrap();
+        assert!(norm(sub(met, through)) < 1e-12, "{met:?}");
+        assert_eq!(nearest_to_lines(lines.iter().map(|&(c, _)| (c, [0.0, 0.6, 0.8]))), None);
     }
 
     #[test]

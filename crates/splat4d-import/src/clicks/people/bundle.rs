@@ -1,11 +1,10 @@
 //! Adjustment of a rig to keypoints of people.
 
 use super::pairs::SCALE;
-use super::{Cameras, LEAST, Rig, Spot, USUAL};
+use super::{Cameras, LEAST, Rig, Seen, Spot, USUAL};
 use crate::sfm::adjust::{Bundle, Free, Priors, Settings, Sighting, View, adjust};
 use crate::sfm::lens::off;
 use splat4d::math::mat3;
-use splat4d::math::se3::{mat_vec, normalize, transpose};
 
 /// Deviation of the logarithm of the focal length about that of most cameras ([`USUAL`]), of principal points (of
 /// the larger side), and of k1. Errors of joints are the same for seconds: a principal point that is as free as for
@@ -59,22 +58,10 @@ impl Cameras<'_> {
     /// Finds where keypoints are; those behind a camera stay open.
     pub(super) fn triangulate(&self, rig: &Rig, spots: &mut [Spot]) {
         for spot in spots {
-            let (mut a, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
-            for (c, seen) in &spot.seen {
-                let Some(pose) = rig.poses[*c] else { continue };
-                let ahead = normalize(mat_vec(&transpose(&pose.rotation), rig.lenses[*c].ray(seen.pixel)));
-                let center = pose.inverse().translation;
-                for r in 0..3 {
-                    for k in 0..3 {
-                        let m = f64::from(u8::from(r == k)) - ahead[r] * ahead[k];
-                        a[r][k] += m;
-                        b[r] += m * center[k];
-                    }
-                }
-            }
+            let line = |(c, seen): &(usize, Seen)| Some(rig.lenses[*c].line(rig.poses[*c].as_ref()?, seen.pixel));
             let before =
                 |x: &[f64; 3]| spot.seen.iter().all(|(c, _)| rig.poses[*c].is_some_and(|pose| pose.apply(*x)[2] > 0.0));
-            spot.place = mat3::solve(a, b).filter(before);
+            spot.place = mat3::nearest_to_lines(spot.seen.iter().filter_map(line)).filter(before);
         }
     }
 

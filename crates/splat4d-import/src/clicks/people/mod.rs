@@ -157,4 +157,4 @@ impl Cameras<'_> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

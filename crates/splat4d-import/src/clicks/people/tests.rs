@@ -22,7 +22,7 @@ fn joint(k: usize, middle: [f64; 2], t: f64) -> [f64; 3] {
 }
 
 /// Where people are in the middle of their ways, by camera; those who stay in place last.
-struct Scene {
+pub(crate) struct Scene {
     walkers: [Vec<[f64; 2]>; 4],
     idle: [Vec<[f64; 2]>; 4],
     /// Share of the frames in which the second camera's detector takes left for right.
@@ -30,12 +30,12 @@ struct Scene {
 }
 
 impl Scene {
-    fn of(walkers: [Vec<[f64; 2]>; 4]) -> Self {
+    pub(crate) fn of(walkers: [Vec<[f64; 2]>; 4]) -> Self {
         Self { walkers, idle: Default::default(), swapped: 0.0 }
     }
 
     /// What detectors find, listed now from the first, now from the last.
-    fn detections(&self, studio: &Studio, noise: f64) -> Vec<Frames> {
+    pub(crate) fn detections(&self, studio: &Studio, noise: f64) -> Vec<Frames> {
         let rng = Rng::new(2, "detections", 0);
         let person = |camera: usize, frame: usize, middle: [f64; 2], still: bool, number: u64| -> Person {
             let t = frame as f64 * FRAME + studio.offsets[camera];

@@ -2,7 +2,7 @@
 
 use super::look::{Shown, SmallImage};
 use splat4d::math::Se3;
-use splat4d::math::mat3::solve;
+use splat4d::math::mat3::nearest_to_lines;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Images with a foreground that are needed.
@@ -81,18 +81,8 @@ fn at_one_place(
     if rays.len() < ENOUGH {
         return None;
     }
-    let (mut matrix, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
-    for (c, d, _) in &rays {
-        for i in 0..3 {
-            for j in 0..3 {
-                let m = f64::from(u8::from(i == j)) - d[i] * d[j];
-                matrix[i][j] += m;
-                right[i] += m * c[j];
-            }
-        }
-    }
     let nowhere = (0.0, f64::INFINITY);
-    let Some(place) = solve(matrix, right) else { return Some(nowhere) };
+    let Some(place) = nearest_to_lines(rays.iter().map(|(c, d, _)| (*c, *d))) else { return Some(nowhere) };
     let spread = rays.iter().map(|(c, ..)| norm(sub(*c, rays[0].0))).fold(0.0, f64::max);
     if spread <= 0.0 {
         return Some(nowhere);
