@@ -43,7 +43,7 @@ impl View {
         Self { camera, colors, grey: grey(color), wanted }
     }
 
-    /// Wants only pixels whose colour differs by more than `limit` (mean of the channels, in [0, 1]) from that in another
+    /// Searches only in pixels whose colour differs by more than `limit` (mean of the channels, in [0, 1]) from that in another
     /// image; differences are blurred by `blur` pixels.
     pub(crate) fn keep_unlike(&mut self, other: &[[u8; 3]], limit: f32, blur: f64) {
         let mut off = self.grey.clone();

@@ -177,7 +177,7 @@ impl<F: Real> Evaluation<F> {
 
     /// Adds to the gradient of result i: that of [`Part::out`](crate::scene::Part::out), of direct colours, and of
     /// weights of colours. Tables may be replaced by others with undefined numbers.
-    pub fn add_gradient(
+    pub(crate) fn add_gradient(
         &mut self,
         i: usize,
         out: &mut Table<F>,

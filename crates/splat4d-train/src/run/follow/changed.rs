@@ -24,9 +24,10 @@ const SEEN: f32 = 0.05;
 /// errors that stay must not make a tile change forever.
 const RISE: (f32, f32) = (1.1, 1e-3);
 
-/// A pixel shows something that is not in the scene where colours are further off than this (mean of the channels, in
-/// [0, 1]), blurred by so many pixels: edges that are off by a pixel are not. Chosen where the bundled crate appears: as
-/// good as 0.1 and 1 pixel with four times the points (studies/records/2026-11-28-follow.md).
+/// A pixel shows something that is not in the scene where colours differ by more than the first number (mean of the
+/// channels, in [0, 1]), blurred by a radius of the second, pixels: edges that are off by a pixel do not. 0.1 and 1 pixel
+/// gained as much where the bundled crate appears, and added more points again in the frame after it
+/// (studies/records/2026-11-28-follow.md).
 const NEW_HERE: (f32, f64) = (0.2, 2.0);
 
 /// Mean absolute errors of the tiles of all views, one after the other.
@@ -117,8 +118,8 @@ impl Comparison<'_> {
         Ok(sums.iter().enumerate().filter(active).map(|(row, _)| row as u32).collect())
     }
 
-    /// The images, of which those pixels are wanted that show something new: unlike the scene, in tiles that disagree (as
-    /// in [`rows`](Self::rows)).
+    /// The images, with those pixels to search in that show something new: unlike the scene, in tiles that disagree (as in
+    /// [`rows`](Self::rows)).
     pub(super) fn new_here(&self, before: &TileErrors, rise: f32) -> Result<Vec<View>> {
         let (mut work, mut picture) = (Blended::default(), Picture::default());
         let (mut first, mut out) = (0, Vec::new());
