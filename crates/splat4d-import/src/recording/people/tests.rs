@@ -46,7 +46,7 @@ fn imported(request: &Request) -> crate::Result<super::Report> {
 fn keypoints_of_two_people_place_and_synchronise_four_cameras() {
     let studio = Studio::new(3);
     let (first, second) = ([0.1, 0.0], [-0.4, 0.5]);
-    let order = |c: usize| if c % 2 == 0 { vec![first, second] } else { vec![second, first] };
+    let order = |c: usize| if c.is_multiple_of(2) { vec![first, second] } else { vec![second, first] };
     let detections = Scene::of(std::array::from_fn(order)).detections(&studio, 3.0);
     let dir = tempfile::tempdir().unwrap();
     let [films, keypoints, take] = ["films", "keypoints", "take"].map(|name| dir.path().join(name));
