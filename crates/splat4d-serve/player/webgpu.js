@@ -117,7 +117,7 @@ export class WebGPUBackend {
   #picture = null;
   #pictureView = null;
   #timer = null;
-  /// The reading of counts that is in progress; whether a later image's were not copied because of it.
+  /// Counts that are being read; whether a later image's were left out for it.
   #reading = null;
   #missed = false;
   #rangeStart = new Uint32Array([0xffffffff, 0]);
@@ -340,7 +340,7 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Resolves when the last image is complete and `stats` are its own. Throws what the device complained about.
+  /// Resolves when the last image and its `stats` are complete. Throws what the device complained about.
   async settled() {
     if (!this.#gone) await this.#queue.onSubmittedWorkDone();
     while (this.#reading) await this.#reading;
@@ -632,8 +632,7 @@ export class WebGPUBackend {
 
   /// Copies counts and times to where they can be read, unless a reading is still in progress.
   #copyStats(encoder) {
-    this.#missed = !!this.#reading;
-    if (this.#missed) return false;
+    if ((this.#missed = !!this.#reading)) return false;
     encoder.copyBufferToBuffer(this.#b.arguments, 0, this.#b.readback, 0, ARGUMENT_BYTES);
     if (this.#timer) {
       encoder.resolveQuerySet(this.#timer, 0, 4, this.#b.times, 0);
@@ -642,7 +641,7 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Without a timer drawMs is the time from the call to the image's end, sort included; a late reading has no `start`.
+  /// Without a timer drawMs is the time from the call (`start`, if known) to the image's end, sort included.
   #readStats(start) {
     const { readback } = this.#b, { stats } = this;
     this.#reading = readback.mapAsync(GPUMapMode.READ).then(() => {
@@ -656,15 +655,15 @@ export class WebGPUBackend {
         stats.drawMs = performance.now() - start;
       }
       readback.unmap();
+    }, () => {}).then(() => { // The device is lost; nothing is rendered any more.
       this.#reading = null;
-      // The last image's counts would never be read: no later image may come.
-      if (this.#missed && !this.#gone) {
-        const encoder = this.#device.createCommandEncoder();
-        this.#copyStats(encoder);
-        this.#queue.submit([encoder.finish()]);
-        this.#readStats(0);
-      }
-    }, () => { this.#reading = null; }); // The device is lost; nothing is rendered any more.
+      // No later image may come.
+      if (!this.#missed || this.#gone) return;
+      const encoder = this.#device.createCommandEncoder();
+      this.#copyStats(encoder);
+      this.#queue.submit([encoder.finish()]);
+      this.#readStats();
+    });
   }
 
   #makePicture() {
