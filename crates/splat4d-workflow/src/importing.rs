@@ -1,6 +1,7 @@
 //! The work behind `import`: videos become a capture, which is checked.
 
 use crate::events::Listener;
+use crate::models::{Kind, Model};
 use crate::report::doctor;
 use serde_json::{Value, json};
 use splat4d::{Error, ErrorKind, Result};
@@ -9,12 +10,15 @@ use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
 use splat4d_import::predicted;
 use splat4d_import::recording::{self, CameraReport, Report, Request};
+use splat4d_import::sfm::learned::{Learned, Matcher, Matches};
+use splat4d_train::capture::Rgb8;
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The file by which a capture is recognised.
@@ -70,6 +74,31 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     };
     warnings(&report).iter().for_each(|w| console.warn(w));
     Ok(Imported { report, checked })
+}
+
+/// A network of two images as the matcher of a [`Request`] ([docs/networks.md](https://github.com/splat4d/splat4d/blob/main/docs/networks.md)).
+/// `described`: the name of a description that the program has, in place of the file next to the network.
+///
+/// Errors: as of [`Model::load`]; the network does not match images.
+pub fn matcher(network: &Path, described: Option<&str>) -> Result<Arc<Learned>> {
+    let model = Model::load(network, described)?;
+    let kind = model.description().output.kind;
+    if kind != Kind::Matches {
+        return Err(Error::input(format!("the network computes {}, not matches", kind.name()))
+            .at(network.display())
+            .remedy("Give a network that matches two images, such as SuperPoint with LightGlue (docs/networks.md)"));
+    }
+    let identity = model.identity().to_owned();
+    Ok(Arc::new(Learned::new(identity, Box::new(Network(model)))))
+}
+
+/// A network that matches images.
+struct Network(Model);
+
+impl Matcher for Network {
+    fn matches(&self, images: [&Rgb8; 2]) -> Result<Matches> {
+        Ok(self.0.matches(images)?.into_iter().map(|both| both.map(|at| at.map(f64::from))).collect())
+    }
 }
 
 /// Makes a capture of poses, depth and images that a network predicted, in one `.npz` (VGGT, Depth Anything 3); training
@@ -217,3 +246,6 @@ fn row(camera: &CameraReport) -> String {
         number(camera.focal, 1.0, 0),
     )
 }
+
+#[cfg(all(test, feature = "models"))]
+mod tests;

@@ -10,7 +10,7 @@ use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_workflow::aligning::Aligning;
-use splat4d_workflow::importing::{import, import_predicted};
+use splat4d_workflow::importing::{import, import_predicted, matcher};
 use splat4d_workflow::parts::left_out;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -97,6 +97,12 @@ pub(crate) struct Args {
     /// Calibrate the cameras by keypoints of people in every frame: a folder with NAME/ or NAME.json of each camera
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["colmap", "points", "assist"])]
     keypoints: Option<PathBuf>,
+    /// A network (.onnx) that matches two images, for cameras whose features do not match
+    #[arg(long, value_name = "ONNX", conflicts_with_all = ["colmap", "points", "assist", "keypoints"])]
+    matcher: Option<PathBuf>,
+    /// Ready-made description of the network, in place of the file next to it
+    #[arg(long, value_name = "NAME", requires = "matcher")]
+    described: Option<String>,
     /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
@@ -220,6 +226,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         synchronous: args.synchronous,
         points: args.points.clone(),
         keypoints: args.keypoints.clone(),
+        matcher: args.matcher.as_ref().map(|network| matcher(network, args.described.as_deref())).transpose()?,
     };
     let stop = interrupt::flag("stopping: stored results are kept");
     if args.assist {

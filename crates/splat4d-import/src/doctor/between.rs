@@ -53,6 +53,7 @@ fn sight(name: &str, number: usize, viewpoint: &Viewpoint, most: usize) -> Camer
         color: [0; 3],
     };
     CameraView {
+        learned: 0,
         name: name.to_owned(),
         size: [viewpoint.picture.width, viewpoint.picture.height],
         factor: 1.0,

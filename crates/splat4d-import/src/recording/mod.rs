@@ -32,12 +32,14 @@ use crate::calibration::Video;
 use crate::clicks::Clicks;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
+use crate::sfm::learned::Learned;
 use crate::sync::graph::{self, Evidence};
 use crate::video::{self, Cropping, Selection, Source};
 use crate::write::{self, Clip, Format, Pictures, Recording};
 use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Whether cameras are static.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -90,6 +92,8 @@ pub struct Request {
     pub points: Option<PathBuf>,
     /// A folder with keypoints of people in all frames, which give the same without clicks.
     pub keypoints: Option<PathBuf>,
+    /// Matches pairs of cameras, or of frames of a moving one, whose features do not match.
+    pub matcher: Option<Arc<Learned>>,
 }
 
 /// Pixels of the shorter side that images get: training on a CPU resolves no more.
@@ -119,6 +123,7 @@ impl Request {
             synchronous: false,
             points: None,
             keypoints: None,
+            matcher: None,
         }
     }
 }
@@ -140,8 +145,8 @@ const CONTRADICTS: f64 = 5.0;
 /// A calibration that more than this part of the judged cameras contradict belongs to another recording.
 const CONTRADICTED: f64 = 0.67;
 /// The remedy where images of fixed cameras have too few matches.
-const BY_HAND: &str =
-    "or click a few points in all cameras (--assist, docs/assist.md), or give keypoints of people (--keypoints); or ";
+const BY_HAND: &str = "or match them by a network (--matcher, docs/networks.md), click a few points in all cameras (--assist, docs/assist.md), \
+     or give keypoints of people (--keypoints); or ";
 /// A camera on its way.
 struct Camera {
     name: String,
@@ -178,7 +183,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         clock = clocks::solve(&cameras, &heard, &told);
         clicked = Some(placed.origin);
     }
-    let stored = stored::Stored::new(folder, &pictures, &known, &masks);
+    let stored = stored::Stored::new(folder, &pictures, &known, &masks).matched_by(request.matcher.as_deref());
     let mut evidence = heard;
     let mut moves = None;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {
@@ -195,7 +200,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let about = format!("{moving} {told:?} {:?}", clock.offsets);
     let solved = poses::once(&cache, &stored, &about, || {
         if moving {
-            poses::walking(&stored, MOST_WALKING, progress)
+            poses::walking(&stored, MOST_WALKING, progress, stop)
         } else {
             poses::fixed_cameras(&stored, clock, &told, progress, stop)
         }

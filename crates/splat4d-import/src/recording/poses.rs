@@ -183,7 +183,7 @@ pub(super) fn fixed_cameras(
     loop {
         round += 1;
         let on: Vec<Option<Offset>> = current.iter().cloned().map(Some).collect();
-        solution = sfm::solve(&stored.on(&on), &options, progress)?;
+        solution = sfm::solve(&stored.on(&on), &options, progress, stop)?;
         if !options.mapping.clocks {
             break;
         }
@@ -268,7 +268,12 @@ fn refined(
 }
 
 /// Places the frames of moving cameras, each on its own.
-pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<'_>) -> Result<Solved> {
+pub(super) fn walking(
+    stored: &Stored<'_>,
+    most: usize,
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Solved> {
     let frames: usize = stored.pictures.iter().map(|p| p.shots.len()).sum();
     if frames < 3 {
         return Err(Error::input(format!("{frames} frames of a moving camera show nothing from enough sides"))
@@ -283,7 +288,7 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
     }
     // One device, one lens: its frames share it.
     let options = Options { walking: Some(most), ..Options::default() };
-    let solution = sfm::solve(stored, &options, progress)?;
+    let solution = sfm::solve(stored, &options, progress, stop)?;
     let mut cameras: Vec<Result<SolvedCamera, String>> =
         stored.pictures.iter().map(|_| Err("no frame was placed".into())).collect();
     for taken in &solution.taken {

@@ -1,6 +1,7 @@
 //! The stored images as structure from motion requests them.
 
 use crate::sfm;
+use crate::sfm::learned::Learned;
 use crate::sfm::lens::Known;
 use crate::sync::graph::Offset;
 use crate::write::{Masks, Pictures};
@@ -20,6 +21,8 @@ pub(super) struct Stored<'a> {
     pub known: &'a [Option<Known>],
     /// Masks of images; empty: none.
     pub masks: &'a [Masks],
+    /// What matches images whose features do not.
+    pub learned: Option<&'a Learned>,
 }
 
 impl<'a> Stored<'a> {
@@ -29,12 +32,17 @@ impl<'a> Stored<'a> {
         known: &'a [Option<Known>],
         masks: &'a [Masks],
     ) -> Self {
-        Self { folder, pictures, offsets: vec![None; pictures.len()], known, masks }
+        Self { folder, pictures, offsets: vec![None; pictures.len()], known, masks, learned: None }
     }
 
     /// The same images on another clock.
     pub(super) fn on(&self, offsets: &[Option<Offset>]) -> Self {
         Self { offsets: offsets.to_vec(), ..*self }
+    }
+
+    /// With what matches images whose features do not.
+    pub(super) fn matched_by(self, learned: Option<&'a Learned>) -> Self {
+        Self { learned, ..self }
     }
 
     /// Given values of a camera.
@@ -51,7 +59,8 @@ impl<'a> Stored<'a> {
     pub(super) fn fingerprint(&self) -> String {
         let prints: Vec<&str> = self.pictures.iter().map(|p| p.fingerprint.as_str()).collect();
         let masks: Vec<u64> = self.masks.iter().map(|m| m.fingerprint).collect();
-        format!("{prints:?} {masks:?} {:?}", self.known)
+        let learned = self.learned.map_or("", Learned::identity);
+        format!("{prints:?} {masks:?} {:?} {learned}", self.known)
     }
 
     /// The static background: the median of some frames, each made into what is worked with.
@@ -96,6 +105,10 @@ impl sfm::pictures::Pictures for Stored<'_> {
 
     fn known(&self, camera: usize) -> Option<Known> {
         Stored::known(self, camera)
+    }
+
+    fn matcher(&self) -> Option<&Learned> {
+        self.learned
     }
 
     fn mask(&self, camera: usize, frame: usize) -> Result<Option<Planes<f32>>> {

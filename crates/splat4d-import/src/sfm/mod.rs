@@ -8,6 +8,7 @@ pub mod adjust;
 pub(crate) mod algebra;
 pub mod align;
 pub mod known;
+pub mod learned;
 pub mod lens;
 pub mod mapper;
 mod overlay;
@@ -24,7 +25,7 @@ use pictures::{CameraView, FeatureOptions, Pictures};
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
 use splat4d_train::event::Progress;
-use tracks::Pairing;
+use tracks::{Link, Pairing};
 
 /// A camera, and the frame of a moving one.
 type CameraFrame = (usize, Option<usize>);
@@ -111,9 +112,16 @@ pub struct Solution {
 /// placed first. Scale and the vertical need other sources. If all poses are known, so are unit and axes: then only
 /// points and clocks are found.
 ///
-/// Errors: images that cannot be read; no two that show one scene.
-pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
-    let (who, sights, pairing): (Vec<CameraFrame>, Vec<CameraView>, Pairing) = match options.walking {
+/// `stop` is called between pairs that a matcher works on.
+///
+/// Errors: images that cannot be read; no two that show one scene; those of a matcher; `stop` requested it.
+pub fn solve(
+    pictures: &dyn Pictures,
+    options: &Options,
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Solution> {
+    let (who, mut sights, pairing): (Vec<CameraFrame>, Vec<CameraView>, Pairing) = match options.walking {
         None => {
             let sights = pictures::fixed(pictures, &options.look, progress)?;
             ((0..sights.len()).map(|c| (c, None)).collect(), sights, Pairing::All)
@@ -125,7 +133,12 @@ pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress
             (who, all.into_iter().map(|(_, _, s)| s).collect(), pairing)
         }
     };
-    solve_sights(&who, &sights, pairing, options, progress)
+    let mut links = tracks::links(&sights, pairing, options.mapping.seed, progress);
+    if let Some(matcher) = pictures.matcher() {
+        let views = learned::Views { pictures, who: &who, pixels: options.look.pixels, seed: options.mapping.seed };
+        matcher.link(&views, &mut sights, pairing, &mut links, progress, stop)?;
+    }
+    solve_sights(&who, &sights, &links, options, progress)
 }
 
 /// This many frames are all compared with each other.
@@ -136,27 +149,27 @@ const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
 fn solve_sights(
     who: &[CameraFrame],
     sights: &[CameraView],
-    pairing: Pairing,
+    links: &[Link],
     options: &Options,
     progress: &mut Progress<'_>,
 ) -> Result<Solution> {
-    let links = tracks::links(sights, pairing, options.mapping.seed, progress);
     if sights.iter().all(|s| s.pose.is_some()) {
-        let mapped = known::about(sights, &links, &options.mapping, progress);
+        let mapped = known::about(sights, links, &options.mapping, progress);
         return Ok(solution(who, sights, mapped, links.len(), 1.0));
     }
     let alone = || {
         Error::input("no two of these images show the same scene").remedy(
             "Film one scene with neighbouring cameras at most 20 degrees apart, in focus and well lit \
-             (docs/filming.md); or click a few points in all cameras (--assist, docs/assist.md).",
+             (docs/filming.md); or match them by a network (--matcher, docs/networks.md), or click a few points in all cameras \
+             (--assist, docs/assist.md).",
         )
     };
     if links.is_empty() {
         return Err(alone());
     }
-    let joined = tracks::join(sights, &links);
-    let focals = tracks::focal_votes(sights, &links, &mapper::FOCALS);
-    let mapped = mapper::map(sights, &joined, &links, &focals, &options.mapping, progress).ok_or_else(alone)?;
+    let joined = tracks::join(sights, links);
+    let focals = tracks::focal_votes(sights, links, &mapper::FOCALS);
+    let mapped = mapper::map(sights, &joined, links, &focals, &options.mapping, progress).ok_or_else(alone)?;
     Ok(in_units(who, sights, mapped, links.len()))
 }
 

@@ -1,5 +1,6 @@
 //! Features of cameras: of the static background on the median image, of what moves at times that all share.
 
+use super::learned::Learned;
 use super::lens::Known;
 use super::overlay::Shown;
 use crate::sync::grey::{Grey, Pyramid};
@@ -40,6 +41,10 @@ pub trait Pictures: Sync {
     fn mask(&self, _camera: usize, _frame: usize) -> Result<Option<Planes<f32>>> {
         Ok(None)
     }
+    /// What matches images whose features do not; usually nothing.
+    fn matcher(&self) -> Option<&Learned> {
+        None
+    }
 }
 
 /// A position in an image that others may show too.
@@ -78,8 +83,10 @@ pub struct CameraView {
     pub lens: usize,
     /// How long a frame lasts, seconds.
     pub frame: f64,
-    /// In the order of times.
+    /// In the order of times; those without a descriptor are last.
     pub features: Vec<Feature>,
+    /// How many have no descriptor: a [`Matcher`](super::learned::Matcher) found them.
+    pub learned: usize,
     /// Source of each time's features, by the time's number; none of a lens that is known, whose features were
     /// straightened.
     pub shown: Vec<Option<Shown>>,
@@ -123,7 +130,7 @@ const TOO_FAR: f64 = 1.0;
 const FASTEST: f64 = 40.0;
 
 /// An image at the size that is worked with, and how many of the file's pixels are one of its.
-fn load(pictures: &dyn Pictures, camera: usize, frame: usize, most: usize) -> Result<(Planes<f32>, f64)> {
+pub(super) fn load(pictures: &dyn Pictures, camera: usize, frame: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let mut picture = pictures.load(camera, frame)?;
     if picture.channels != 3 || picture.width.min(picture.height) < 32 {
         let what = format!("an image of {}x{} with {} channels", picture.width, picture.height, picture.channels);
@@ -143,31 +150,30 @@ fn spread(of: usize, count: usize) -> Vec<usize> {
     (0..kept).map(|k| (2 * k + 1) * of / (2 * kept)).collect()
 }
 
-fn bytes(picture: &Planes<f32>) -> Vec<u8> {
+pub(super) fn bytes(picture: &Planes<f32>) -> Vec<u8> {
     picture.data.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect()
 }
 
 /// Mask of an image.
-struct Mask {
+pub(super) struct Mask {
     mask: Planes<f32>,
     size: [usize; 2],
 }
 
 impl Mask {
-    fn counts(&self, x: usize, y: usize) -> bool {
+    pub(super) fn counts(&self, x: usize, y: usize) -> bool {
         let [w, h] = self.size;
         self.mask.get(0, y * self.mask.height / h, x * self.mask.width / w) > 0.5
     }
 }
 
 /// The mask for an image at the size that is worked with.
-fn mask(pictures: &dyn Pictures, camera: usize, frame: usize, picture: &Planes<f32>) -> Result<Option<Mask>> {
-    let size = [picture.width, picture.height];
+pub(super) fn mask(pictures: &dyn Pictures, camera: usize, frame: usize, size: [usize; 2]) -> Result<Option<Mask>> {
     Ok(pictures.mask(camera, frame)?.map(|mask| Mask { mask, size }))
 }
 
 /// The static background: the median over some frames, channel by channel.
-fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Result<(Planes<f32>, f64)> {
+pub(super) fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let frames = spread(pictures.frames(camera), MEDIAN_OF);
     let (mut out, factor) = load(pictures, camera, frames[0], most)?;
     if frames.len() < MEDIAN_FROM {
@@ -191,7 +197,7 @@ fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Result<(Planes
     Ok((out, factor))
 }
 
-fn color_at(picture: &Planes<f32>, [u, v]: [f64; 2]) -> [u8; 3] {
+pub(super) fn color_at(picture: &Planes<f32>, [u, v]: [f64; 2]) -> [u8; 3] {
     let x = (u.max(0.0) as usize).min(picture.width - 1);
     let y = (v.max(0.0) as usize).min(picture.height - 1);
     [0, 1, 2].map(|c| (picture.get(c, y, x) * 255.0).round().clamp(0.0, 255.0) as u8)
@@ -266,7 +272,7 @@ fn sight(pictures: &dyn Pictures, camera: usize, look: &FeatureOptions, moments:
     let (background, factor) = median(pictures, camera, look.pixels)?;
     let limits = |most: usize| Limits { contrast: look.contrast, most };
     // The static background counts where the middle frame does.
-    let counts = mask(pictures, camera, pictures.frames(camera) / 2, &background)?;
+    let counts = mask(pictures, camera, pictures.frames(camera) / 2, [background.width, background.height])?;
     let mut features =
         found(&background, limits(look.still), &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0);
     let frame = frame_length(pictures, camera);
@@ -302,11 +308,17 @@ fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) 
         lens: pictures.lens(camera),
         frame: 0.0,
         features: Vec::new(),
+        learned: 0,
         shown: Vec::new(),
     }
 }
 
 impl CameraView {
+    /// The features that have descriptors.
+    pub(crate) fn described(&self) -> &[Feature] {
+        &self.features[..self.features.len() - self.learned]
+    }
+
     /// Takes away the distortion of a lens that is known.
     fn straightened(mut self, pictures: &dyn Pictures, camera: usize) -> Self {
         let Some(known) = pictures.known(camera) else { return self };
@@ -370,7 +382,7 @@ fn moving(
         *v = (0..3).map(|c| (picture.plane(c)[p] - background.plane(c)[p]).abs()).sum::<f32>() / 3.0;
     }
     let off = blurred(&off, MOVED_BLUR);
-    let counts = mask(pictures, camera, frame, &picture)?;
+    let counts = mask(pictures, camera, frame, [picture.width, picture.height])?;
     let wanted = |x: usize, y: usize| off.get(0, y, x) > MOVED && counts.as_ref().is_none_or(|m| m.counts(x, y));
     let Some(window) = Window::around(picture.width, picture.height, &wanted) else { return Ok((Vec::new(), None)) };
     let limits = Limits { contrast: look.contrast, most: look.moving };
@@ -439,7 +451,7 @@ pub(crate) fn walking(
             .map(|&(camera, frame)| {
                 let (picture, factor) = load(pictures, camera, frame, look.pixels)?;
                 let limits = Limits { contrast: look.contrast, most: look.still };
-                let counts = mask(pictures, camera, frame, &picture)?;
+                let counts = mask(pictures, camera, frame, [picture.width, picture.height])?;
                 let sight = CameraView {
                     name: format!("{}, frame {frame}", pictures.name(camera)),
                     frame: frame_length(pictures, camera),

@@ -57,7 +57,7 @@ pub(crate) enum Pairing {
 }
 
 impl Pairing {
-    fn pairs(self, count: usize) -> Vec<[usize; 2]> {
+    pub(super) fn pairs(self, count: usize) -> Vec<[usize; 2]> {
         let wanted = |a: usize, b: usize| match self {
             Self::All => true,
             Self::Sequence { near, every } => b - a <= near || (a.is_multiple_of(every) && b.is_multiple_of(every)),
@@ -153,7 +153,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
 
 /// Compares images and keeps what agrees with one motion between them, in the order of pairs.
 pub(crate) fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
-    let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(&s.features)).collect();
+    let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(s.described())).collect();
     let pairs = pairing.pairs(sights.len());
     let mut out = Vec::new();
     for (part, chunk) in pairs.chunks(TOGETHER).enumerate() {
@@ -195,7 +195,7 @@ pub(crate) fn guided(
     tolerance: f64,
     progress: &mut Progress<'_>,
 ) -> Vec<Link> {
-    let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(&s.features)).collect();
+    let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(s.described())).collect();
     let near = |&[a, b]: &[usize; 2]| match (&known[a], &known[b]) {
         (Some(p), Some(q)) => dot(p.camera.forward(), q.camera.forward()) > WIDEST.to_radians().cos(),
         _ => false,
@@ -287,7 +287,13 @@ pub(crate) fn about_middle(sight: &CameraView, pixel: [f64; 2]) -> [f64; 2] {
     std::array::from_fn(|k| pixel[k] - 0.5 * sight.size[k] as f64)
 }
 
-fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)>, rng: Rng) -> Option<Link> {
+/// What agrees with one motion between two images; `None`: too little.
+pub(super) fn verified(
+    sights: &[CameraView],
+    [a, b]: [usize; 2],
+    matches: Vec<([usize; 2], f32)>,
+    rng: Rng,
+) -> Option<Link> {
     if matches.len() < LEAST {
         return None;
     }
@@ -388,6 +394,7 @@ mod tests {
             lens: 0,
             frame: 0.03,
             features,
+            learned: 0,
             shown: Vec::new(),
         }
     }

@@ -377,6 +377,8 @@ def import_videos(
     calibration: _Path | None = None,
     colmap: bool = False,
     points: _Path | None = None,
+    matcher: _Path | None = None,
+    described: str | None = None,
     masks: _Path | None = None,
     deinterlace: bool = False,
     png: bool = False,

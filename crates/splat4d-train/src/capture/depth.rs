@@ -4,6 +4,7 @@
 //! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
 
 use super::Frame;
+use super::depth_field::Field;
 use super::exr;
 use super::json;
 use super::lens::Distortion;
@@ -58,6 +59,8 @@ pub(crate) struct DepthFit {
     pub scale: f64,
     /// What 0 would be.
     pub shift: f64,
+    /// Relative errors of the map over the image.
+    pub field: Field,
     /// Nearest and farthest depths that are believed; others are not known.
     pub range: [f64; 2],
 }
@@ -68,6 +71,18 @@ impl DepthFit {
         let value = self.scale * number + self.shift;
         let depth = if self.inverse { 1.0 / value } else { value };
         if (self.range[0]..=self.range[1]).contains(&depth) { depth as f32 } else { 0.0 }
+    }
+
+    /// Removes the smooth errors from a map of the whole pinhole view.
+    fn remove_errors(&self, map: &mut [f32], width: usize, height: usize) {
+        if self.field == Field::ZERO {
+            return;
+        }
+        for (p, z) in map.iter_mut().enumerate() {
+            let place = [((p % width) as f64 + 0.5) / width as f64, ((p / width) as f64 + 0.5) / height as f64];
+            let error = 1.0 + self.field.at(place);
+            *z = (f64::from(*z) * if self.inverse { error } else { 1.0 / error }) as f32;
+        }
     }
 }
 
@@ -85,7 +100,10 @@ pub(crate) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<
             .at(file.path.display())
             .remedy("Write it in the image's shape (it may be smaller or larger as a whole)"));
     }
-    let full = straighten(&map, source);
+    let mut full = straighten(&map, source);
+    if let Some(fit) = &file.fit {
+        fit.remove_errors(&mut full, source.width, source.height);
+    }
     Ok(reduce(&full, source.width, source.height, downscale))
 }
 

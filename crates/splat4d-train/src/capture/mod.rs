@@ -14,6 +14,7 @@ mod colmap_files;
 mod computed;
 mod convention;
 mod depth;
+pub(crate) mod depth_field;
 mod elsewhere;
 mod evidence;
 mod exr;

@@ -2,13 +2,19 @@
 //!
 //! Gaussians begin on metric maps only, which is what maps gain (studies/records/2026-11-28-models.md). A single image
 //! determines its shift badly where its points are at similar depths, so contrasts of a camera's maps are fused: how much the
-//! inverse depth varies over an image changes slowly from frame to frame.
+//! inverse depth varies over an image changes slowly from frame to frame. Smooth errors, which no scale and shift removes, are
+//! a field over the image where points that were left out agree with it.
+//!
+//! A map's number is what has the error, so it is explained by the depth and not the depth by it: the other regression's
+//! contrast is too large, by 17 % at errors of 10 %, and what is far from the points then has a wrong depth.
 
 use super::open::{OpenCapture, training_frames};
 use crate::Result;
+use crate::capture::depth_field::{self as field, Field};
 use crate::capture::{Capture, DepthFit, DepthKind, depth_map};
 use crate::recipe::Recipe;
 use rayon::prelude::*;
+use splat4d::math::cholesky::Cholesky;
 use splat4d::math::{Rng, median};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,8 +27,9 @@ const POINTS: usize = 4000;
 const MOST: f64 = 0.5;
 /// Pairs of points that are tried as a map's scale and shift.
 const TRIES: usize = 300;
-/// Errors of an inverse depth from this share on count alike in the search: points that something hides.
-const HIDDEN: f64 = 0.1;
+/// Relative errors from this one on count alike in the search: points that something hides. Three times a large error of a
+/// map: 0.1 found lines through maps with errors of 10 % that were a third of the true contrast.
+const HIDDEN: f64 = 0.3;
 /// A falling line that leaves less than this share of the rising one's errors: the map is upside down.
 const FALLING: f64 = 0.7;
 /// Share of the points in an image that nothing hides, at least: fits are judged by the closest this many, whose largest error
@@ -37,12 +44,29 @@ const ROUNDS: usize = 20;
 const SHARPEST: f64 = 1e-3;
 /// How much contrasts of one camera's maps vary over time, relative.
 const CHANGES: f64 = 0.2;
+/// Typical size of smooth errors, relative, and of their second differences from node to node: those of networks.
+const SMOOTH: f64 = 0.1;
+/// Least spread of the other errors that a field of smooth ones assumes: less would be noise of pixels.
+const NOISE: f64 = 0.02;
+/// A field is used where it leaves at most this share of the errors of points that it has not seen.
+const GAIN: f64 = 0.9;
 /// Errors of neighbouring pixels are alike: an image has as many independent ones, at most.
 const INDEPENDENT: f64 = 16.0;
 /// A map whose errors have more than this standard deviation (relative) does not show the points at any scale and shift.
 const FOREIGN: f64 = 0.2;
 /// Depths outside of those of the points by more than this factor are guesses, and count as unknown.
 const BEYOND: f64 = 4.0;
+
+/// A point in an image.
+#[derive(Clone, Copy, Debug)]
+struct Pair {
+    /// Standardised number of the map.
+    x: f64,
+    /// What it is to become.
+    y: f64,
+    /// Where, from 0 to 1 over the image.
+    place: [f64; 2],
+}
 
 /// What a map and the points in its image have in common.
 struct Sample {
@@ -51,17 +75,17 @@ struct Sample {
     /// Median and spread of the map.
     center: f64,
     spread: f64,
-    /// Standardised values of the map, and what they are to become.
-    pairs: Vec<[f64; 2]>,
+    pairs: Vec<Pair>,
     /// Nearest and farthest of the points.
     range: [f64; 2],
 }
 
-/// Slope and value at 0 of a line, and the standard deviation of relative errors of what is visible.
+/// x = `contrast` y (1 + field) + `level`, and the standard deviation of relative errors of what is visible.
 #[derive(Clone, Copy, Debug)]
-struct Line {
-    slope: f64,
+struct Fit {
+    contrast: f64,
     level: f64,
+    field: Field,
     off: f64,
 }
 
@@ -75,37 +99,29 @@ pub(super) fn aligned(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCaptu
     if samples.is_empty() {
         return Ok((opened, None));
     }
-    let first: Vec<Option<Line>> = samples.par_iter().map(|s| search(&s.pairs, s.frame)).collect();
-    let mut slopes: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+    let first: Vec<Option<Fit>> = samples.par_iter().map(|s| search(&s.pairs, s.frame)).collect();
+    let camera = |sample: &Sample| opened.capture.frames[sample.frame].camera;
+    let mut contrasts: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
     for (sample, line) in samples.iter().zip(&first) {
-        let camera = opened.capture.frames[sample.frame].camera;
-        slopes.entry(camera).or_default().extend(line.map(|l| l.slope));
+        contrasts.entry(camera(sample)).or_default().extend(line.map(|l| l.contrast));
     }
     let usual: BTreeMap<usize, f64> =
-        slopes.iter_mut().filter_map(|(camera, slopes)| Some((*camera, median(slopes)?))).collect();
-    let mut fits: BTreeMap<usize, DepthFit> = BTreeMap::new();
-    for (sample, line) in samples.iter().zip(first) {
-        let camera = opened.capture.frames[sample.frame].camera;
-        let Some(&usual) = usual.get(&camera) else { continue };
-        let mut levels: Vec<f64> = sample.pairs.iter().map(|[x, y]| y - usual * x).collect();
-        let Some(level) = median(&mut levels) else { continue };
-        let begin =
-            line.filter(|l| (l.slope / usual - 1.0).abs() < CHANGES).unwrap_or(Line { slope: usual, level, off: 0.0 });
-        let line = refined(&sample.pairs, begin, Some(usual));
-        if line.off > FOREIGN || line.slope <= 0.0 {
-            continue;
-        }
+        contrasts.iter_mut().filter_map(|(camera, contrasts)| Some((*camera, median(contrasts)?))).collect();
+    let fitted = |(sample, line): (&Sample, &Option<Fit>)| {
+        let fit = smooth(&sample.pairs, *line, *usual.get(&camera(sample))?)?;
         let kind = opened.capture.frames[sample.frame].depth.as_ref().map(|d| d.kind);
-        fits.insert(
-            sample.frame,
-            DepthFit {
-                inverse: kind == Some(DepthKind::Inverse),
-                scale: line.slope / sample.spread,
-                shift: line.level - line.slope * sample.center / sample.spread,
-                range: [sample.range[0] / BEYOND, sample.range[1] * BEYOND],
-            },
-        );
-    }
+        let scale = 1.0 / (fit.contrast * sample.spread);
+        let depth = DepthFit {
+            inverse: kind == Some(DepthKind::Inverse),
+            scale,
+            shift: -fit.level / fit.contrast - scale * sample.center,
+            field: fit.field,
+            range: [sample.range[0] / BEYOND, sample.range[1] * BEYOND],
+        };
+        Some((sample.frame, depth))
+    };
+    let fits: Vec<Option<(usize, DepthFit)>> = samples.par_iter().zip(&first).map(fitted).collect();
+    let fits: BTreeMap<usize, DepthFit> = fits.into_iter().flatten().collect();
     if (fits.len() as f64) < MOST * asked as f64 {
         let what = format!(
             "{} of {asked} depth maps fit the capture's points at some scale and shift: maps are compared with the scene up to \
@@ -170,7 +186,11 @@ fn sample(capture: &Capture, frame: usize, still: &[[f64; 3]]) -> Result<Option<
         let inside = (0.0..camera.width as f64).contains(&u) && (0.0..camera.height as f64).contains(&v);
         let value = if inside { f64::from(values[v as usize * camera.width + u as usize]) } else { 0.0 };
         if value != 0.0 && z > 0.0 {
-            pairs.push([(value - center) / spread, if file.kind == DepthKind::Inverse { 1.0 / z } else { z }]);
+            pairs.push(Pair {
+                x: (value - center) / spread,
+                y: if file.kind == DepthKind::Inverse { 1.0 / z } else { z },
+                place: [u / camera.width as f64, v / camera.height as f64],
+            });
             range = [range[0].min(z), range[1].max(z)];
         }
     }
@@ -178,83 +198,124 @@ fn sample(capture: &Capture, frame: usize, still: &[[f64; 3]]) -> Result<Option<
 }
 
 /// The rising line on which most pairs are: of two of them, then refined. `None`: no two rise.
-fn search(pairs: &[[f64; 2]], frame: usize) -> Option<Line> {
+fn search(pairs: &[Pair], frame: usize) -> Option<Fit> {
     let rng = Rng::new(frame as u64, "depth alignment", 0);
-    let (mut best, mut falling): (Option<(f64, Line)>, f64) = (None, f64::INFINITY);
+    let (mut best, mut falling): (Option<(f64, Fit)>, f64) = (None, f64::INFINITY);
     for k in 0..TRIES {
         let [a, b] = [2 * k, 2 * k + 1].map(|i| pairs[rng.below(i as u64, pairs.len())]);
-        let slope = (a[1] - b[1]) / (a[0] - b[0]);
-        if !slope.is_finite() {
+        let contrast = (a.x - b.x) / (a.y - b.y);
+        if !contrast.is_finite() || contrast == 0.0 {
             continue;
         }
-        let line = Line { slope, level: a[1] - slope * a[0], off: 0.0 };
-        let cost: f64 = pairs.iter().map(|p| line.error(p).abs().min(HIDDEN)).sum();
-        if slope <= 0.0 {
+        let line = Fit::line(contrast, a.x - contrast * a.y);
+        let cost = line.cost(pairs.iter());
+        if contrast < 0.0 {
             falling = falling.min(cost);
         } else if best.is_none_or(|(least, _)| cost < least) {
             best = Some((cost, line));
         }
     }
-    best.filter(|(cost, _)| falling >= FALLING * cost).map(|(_, line)| refined(pairs, line, None))
+    best.filter(|(cost, _)| falling >= FALLING * cost).map(|(_, line)| refined(pairs, line, None, false))
 }
 
-impl Line {
-    /// Relative to what the pair is to become.
-    fn error(&self, [x, y]: &[f64; 2]) -> f64 {
-        (self.slope * x + self.level) / y - 1.0
+/// The fit from a line on (none: that of the usual contrast), with a field where it predicts points that it has not seen.
+/// `None`: the map does not show the points.
+fn smooth(pairs: &[Pair], line: Option<Fit>, usual: f64) -> Option<Fit> {
+    let mut levels: Vec<f64> = pairs.iter().map(|p| p.x - usual * p.y).collect();
+    let level = median(&mut levels)?;
+    let begin = line.filter(|l| (usual / l.contrast - 1.0).abs() < CHANGES).unwrap_or(Fit::line(usual, level));
+    let fit = |pairs: &[Pair], field: bool| refined(pairs, begin, Some(usual), field);
+    let line = fit(pairs, false);
+    if line.off > FOREIGN || line.contrast <= 0.0 {
+        return None;
+    }
+    let halves = [0, 1].map(|half| pairs.iter().copied().skip(half).step_by(2).collect::<Vec<_>>());
+    let left = |field: bool| fit(&halves[0], field).cost(&halves[1]) + fit(&halves[1], field).cost(&halves[0]);
+    let with = if left(true) <= GAIN * left(false) { fit(pairs, true) } else { line };
+    Some(if with.contrast > 0.0 && with.field.is_small() { with } else { line })
+}
+
+impl Fit {
+    fn line(contrast: f64, level: f64) -> Self {
+        Self { contrast, level, field: Field::ZERO, off: 0.0 }
+    }
+
+    /// Of the map's number, relative to what the pair is to become.
+    fn error(&self, pair: &Pair) -> f64 {
+        (pair.x - self.level) / (self.contrast * pair.y) - 1.0 - self.field.at(pair.place)
+    }
+
+    /// The sum of errors, those of hidden points alike.
+    fn cost<'a>(&self, pairs: impl IntoIterator<Item = &'a Pair>) -> f64 {
+        pairs.into_iter().map(|p| self.error(p).abs().min(HIDDEN)).sum()
     }
 
     /// The standard deviation of the errors of what is visible.
-    fn deviation(&self, pairs: &[[f64; 2]]) -> f64 {
+    fn deviation(&self, pairs: &[Pair]) -> f64 {
         let mut errors: Vec<f64> = pairs.iter().map(|p| self.error(p).abs()).collect();
         let at = (VISIBLE * errors.len() as f64) as usize;
         *errors.select_nth_unstable_by(at, f64::total_cmp).1 / OF_DEVIATION
     }
 }
 
-/// Least squares with Tukey's weights from a line on. `usual`: the slope that other frames have. The deviation only falls:
+/// Least squares with Tukey's weights from a fit on. `usual`: the contrast that other frames have. The deviation only falls:
 /// else what is hidden gains weight round by round.
-fn refined(pairs: &[[f64; 2]], mut line: Line, usual: Option<f64>) -> Line {
-    let (n, mut deviation) = (pairs.len() as f64, f64::INFINITY);
+///
+/// Unknown are contrast and level by the contrast of the start, c, and the nodes times the contrast by c:
+/// x / (c y) = a + b / y + Σ w g.
+fn refined(pairs: &[Pair], mut fit: Fit, usual: Option<f64>, field: bool) -> Fit {
+    let (count, mut deviation) = (pairs.len() as f64, f64::INFINITY);
+    let unknown = if field { 2 + field::COUNT } else { 2 };
+    let rough = field::roughness();
+    let start = usual.unwrap_or(fit.contrast);
     for _ in 0..ROUNDS {
-        deviation = line.deviation(pairs).min(deviation).max(SHARPEST);
-        let [mut xx, mut x1, mut one, mut xy, mut y1] = [0.0; 5];
+        deviation = fit.deviation(pairs).min(deviation).max(SHARPEST);
+        let (mut matrix, mut side) = (vec![0.0; unknown * unknown], vec![0.0; unknown]);
         for p in pairs {
-            let [x, y] = *p;
-            let off = line.error(p) / (TUKEY * deviation);
-            let weight = (1.0 - off * off).max(0.0).powi(2) / (y * y);
-            xx += weight * x * x;
-            x1 += weight * x;
-            one += weight;
-            xy += weight * x * y;
-            y1 += weight * y;
+            let off = fit.error(p) / (TUKEY * deviation);
+            let weight = (1.0 - off * off).max(0.0).powi(2);
+            let nodes = field::weights(p.place).map(|(node, w)| (2 + node, w));
+            let row = [(0, 1.0), (1, 1.0 / p.y)].into_iter().chain(nodes.into_iter().filter(|_| field));
+            for (i, v) in row.clone() {
+                side[i] += weight * v * p.x / (start * p.y);
+                row.clone().for_each(|(j, w)| matrix[i * unknown + j] += weight * v * w);
+            }
         }
-        if let Some(usual) = usual {
-            let trust = (deviation / (CHANGES * usual)).powi(2) * n / n.min(INDEPENDENT);
-            xx += trust;
-            xy += trust * usual;
+        if field {
+            let least = (deviation.max(NOISE) / SMOOTH).powi(2);
+            for (i, j) in (0..field::COUNT).flat_map(|i| (0..field::COUNT).map(move |j| (i, j))) {
+                let own = if i == j { 1.0 } else { 0.0 };
+                matrix[(2 + i) * unknown + 2 + j] += least * (own + rough[i * field::COUNT + j]);
+            }
         }
-        let determinant = xx * one - x1 * x1;
-        if determinant <= 0.0 || !determinant.is_finite() {
-            break;
+        if usual.is_some() {
+            let trust = (deviation / CHANGES).powi(2) * count / count.min(INDEPENDENT);
+            matrix[0] += trust;
+            side[0] += trust;
         }
-        line = Line { slope: (xy * one - x1 * y1) / determinant, level: (xx * y1 - x1 * xy) / determinant, off: 0.0 };
+        let Some(solved) = Cholesky::with_pivots(unknown, matrix, f64::EPSILON).map(|c| c.solve(side)) else { break };
+        fit.contrast = solved[0] * start;
+        fit.level = solved[1] * start;
+        if field {
+            fit.field = Field::new(std::array::from_fn(|node| solved[2 + node] / solved[0]));
+        }
     }
-    line.off = line.deviation(pairs);
-    line
+    fit.off = fit.deviation(pairs);
+    fit
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn pairs(seed: u64, hidden: f64) -> Vec<[f64; 2]> {
+    fn pairs(seed: u64, hidden: f64) -> Vec<Pair> {
         let rng = Rng::new(seed, "pairs", 0);
         let one = |k: usize| {
-            let x = 2.0 * rng.uniform(2 * k as u64) - 1.0;
-            let y = (0.1 * x + 0.4) * (1.0 + 0.02 * (2.0 * rng.uniform(2 * k as u64 + 1) - 1.0));
+            let [x, off, u, v] = [0, 1, 2, 3].map(|i| rng.uniform((4 * k + i) as u64));
+            let x = 2.0 * x - 1.0;
+            let y = (0.1 * x + 0.4) * (1.0 + 0.02 * (2.0 * off - 1.0));
             // What hides a point is nearer, so that the point is farther than the map shows.
-            [x, if (k as f64) < 100.0 * hidden { 0.5 * y } else { y }]
+            Pair { x, y: if (k as f64) < 100.0 * hidden { 0.5 * y } else { y }, place: [u, v] }
         };
         (0..100).map(one).collect()
     }
@@ -263,21 +324,53 @@ mod tests {
     fn lines_are_found_although_a_third_is_hidden() {
         for seed in 0..8 {
             let line = search(&pairs(seed, 0.33), seed as usize).unwrap();
-            assert!((line.slope - 0.1).abs() < 0.01 && (line.level - 0.4).abs() < 0.01, "{line:?}");
+            assert!((line.contrast - 10.0).abs() < 1.0 && (line.level + 4.0).abs() < 0.4, "{line:?}");
         }
     }
 
     #[test]
     fn upside_down_is_not_accepted() {
-        let turned: Vec<[f64; 2]> = pairs(1, 0.0).into_iter().map(|[x, y]| [-x, y]).collect();
+        let turned: Vec<Pair> = pairs(1, 0.0).into_iter().map(|p| Pair { x: -p.x, ..p }).collect();
         assert!(search(&turned, 0).is_none());
     }
 
     #[test]
-    fn other_frames_determine_the_slope_of_points_at_one_depth() {
-        let flat: Vec<[f64; 2]> =
-            (0..60).map(|k| [0.05 * f64::from(k % 7) - 0.15, 0.4 + 0.01 * f64::from(k % 5 - 2)]).collect();
-        let line = refined(&flat, Line { slope: 0.1, level: 0.4, off: 0.0 }, Some(0.1));
-        assert!((line.slope / 0.1 - 1.0).abs() < 0.3 && (line.level - 0.4).abs() < 0.01, "{line:?}");
+    fn other_frames_determine_the_contrast_of_points_at_one_depth() {
+        let flat: Vec<Pair> = (0..60)
+            .map(|k| Pair { x: 0.05 * f64::from(k % 7) - 0.15, y: 0.4 + 0.01 * f64::from(k % 5 - 2), place: [0.5; 2] })
+            .collect();
+        let line = refined(&flat, Fit::line(10.0, -4.0), Some(10.0), false);
+        assert!((line.contrast / 10.0 - 1.0).abs() < 0.3 && (line.level + 10.0 * 0.4).abs() < 1.3, "{line:?}");
+    }
+
+    /// Points on a floor and a wall; the map is x = 10 y (1 + smooth error) − 4.
+    fn uneven(smooth: f64, seed: u64) -> Vec<Pair> {
+        let rng = Rng::new(seed, "uneven", 0);
+        let one = |k: usize| {
+            let [u, v, off] = [0, 1, 2].map(|i| rng.uniform((3 * k + i) as u64));
+            let y = if v > 0.7 { 0.2 + 0.6 * (v - 0.7) } else { 0.2 };
+            let error = smooth * (3.0 * u + seed as f64).sin() * (4.0 * v).cos() + 0.02 * (2.0 * off - 1.0);
+            Pair { x: 10.0 * y * (1.0 + error) - 4.0, y, place: [u, v] }
+        };
+        (0..300).map(one).collect()
+    }
+
+    #[test]
+    fn smooth_errors_become_a_field_and_noise_does_not() {
+        for seed in 0..4 {
+            let tilted = uneven(0.15, seed);
+            let [line, fit] =
+                [refined(&tilted, Fit::line(10.0, -4.0), Some(10.0), false), smooth(&tilted, None, 10.0).unwrap()];
+            assert!(fit.off < 0.03 && line.off > 0.05, "{} {}", fit.off, line.off);
+            // Something near, at which there are no points.
+            for u in [0.2, 0.5, 0.8] {
+                let (y, place) = (0.5, [u, 0.5]);
+                let x = 10.0 * y * (1.0 + 0.15 * (3.0 * u + seed as f64).sin() * 2.0f64.cos()) - 4.0;
+                let off = fit.error(&Pair { x, y, place });
+                assert!(off.abs() < 0.06, "seed {seed}, {u}: {off}");
+            }
+        }
+        let even = smooth(&uneven(0.0, 1), None, 10.0).unwrap();
+        assert_eq!(even.field, Field::ZERO);
     }
 }

@@ -93,16 +93,17 @@ impl Fit<'_> {
             Ok(Some(Record { frame, active, params, origin, errors, exposure, facts: Value::Null }))
         };
         let coefficients = self.history.coefficients();
-        if active.is_empty() {
-            return record(Params::new(0, coefficients, &[]), Vec::new(), active, &scene);
-        }
         let rows = scene.len();
         let extent = self.opened.plan(&frame_recipe(self.recipe, rows)).extent;
-        let mut scene = self.split(&active, extent, exposure.as_ref())?;
-        let seeds = self.appeared(&scene, exposure.as_ref(), rise)?;
+        let mut moved_on = self.split(&active, extent, exposure.as_ref())?;
+        let seeds = self.appeared(&moved_on, exposure.as_ref(), rise)?;
+        // What appears may hide an empty background alone.
+        if active.is_empty() && seeds.points.is_empty() {
+            return record(Params::new(0, coefficients, &[]), Vec::new(), active, &scene);
+        }
         let recipe = frame_recipe(self.recipe, rows + seeds.len());
         let plan = self.opened.plan(&recipe);
-        let layer = &mut scene.layers[0];
+        let layer = &mut moved_on.layers[0];
         *layer = still(self.learning(&layer.params, &self.begun(&recipe, &plan, &seeds)?)?);
         let mut stage = still_method::stage(&format!("frame {}", self.frame), &plan);
         stage.freeze_exposure = true;
@@ -112,7 +113,7 @@ impl Fit<'_> {
             group.rate.start *= follow.rates;
             group.rate.end *= follow.rates;
         }
-        let mut trainer = self.opened.trainer_of(&plan, scene, vec![stage]);
+        let mut trainer = self.opened.trainer_of(&plan, moved_on, vec![stage]);
         trainer.train_state.exposure = self.exposure();
         if !drive(&mut trainer, &format!("frame {}", self.frame), stop, listen)? {
             return Ok(None);
