@@ -96,6 +96,7 @@ fn a_network_relates_cameras_whose_features_do_not() {
     assert!(error.contains("computes depth, not matches"), "{error}");
     let request = |name: &str, matcher: Option<Arc<Learned>>| Request {
         sound: false,
+        synchronous: true,
         format: Format::Png,
         selection: Selection { size: None, ..Selection::default() },
         matcher,
