@@ -89,7 +89,7 @@ fn main() -> Result<()> {
             eprintln!("{:7.1} s  {name} {done}/{total}", start.elapsed().as_secs_f64());
         }
     };
-    let solution = solve(&shown, &options, &mut Progress(&mut tell))?;
+    let solution = solve(&shown, &options, &mut Progress(&mut tell), &|| false)?;
     println!("{:.1} s, {} pairs, {} points", start.elapsed().as_secs_f64(), solution.pairs, solution.points.len());
     let truth = |k: usize| {
         let taken = &solution.taken[k];

@@ -51,12 +51,13 @@
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `following.rs` | captures that are still being filmed |
-//! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
+//! | `models/` | networks that users bring |
+//! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture, also matched by a network; what a capture, run or file contains |
 //! | `storage/` | captures and runs on object storage |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `aligning.rs` | points clicked in a page, for an import |
-//! | `models/`, `priors.rs`, `priors/` | networks that users bring; depth, flow, masks and tracks from them |
+//! | `priors.rs`, `priors/` | depth, flow, masks and tracks from networks |
 //! | `recipe_schema.rs` | a JSON Schema of recipes, for editors |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 

@@ -10,12 +10,13 @@ pub mod align;
 pub mod known;
 pub mod learned;
 pub mod lens;
+mod linking;
 pub mod mapper;
 mod overlay;
 pub mod pictures;
 pub mod resection;
 mod sample;
-pub mod tracks;
+pub(crate) mod tracks;
 pub mod two_view;
 
 use crate::{Error, Result};
@@ -135,8 +136,8 @@ pub fn solve(
     };
     let mut links = tracks::links(&sights, pairing, options.mapping.seed, progress);
     if let Some(matcher) = pictures.matcher() {
-        let views = learned::Views { pictures, who: &who, pixels: options.look.pixels, seed: options.mapping.seed };
-        matcher.link(&views, &mut sights, pairing, &mut links, progress, stop)?;
+        let views = linking::Views { pictures, who: &who, pixels: options.look.pixels, seed: options.mapping.seed };
+        linking::link(matcher, &views, &mut sights, pairing, &mut links, progress, stop)?;
     }
     solve_sights(&who, &sights, &links, options, progress)
 }

@@ -15,7 +15,7 @@ use splat4d::scene::Planes;
 
 /// Part of an image as features were taken from it, grey.
 #[derive(Clone, Debug)]
-pub struct Shown {
+pub(crate) struct Shown {
     /// Pixel of the whole image at which it begins.
     pub corner: [usize; 2],
     pub width: usize,

@@ -49,7 +49,7 @@ pub trait Pictures: Sync {
 
 /// A position in an image that others may show too.
 #[derive(Clone, Debug)]
-pub struct Feature {
+pub(crate) struct Feature {
     /// Pixels.
     pub pixel: [f64; 2],
     /// Pixels a second; zero for the static background.
@@ -65,7 +65,7 @@ pub struct Feature {
 
 /// A camera that is to be placed: all of a fixed one's images, or one frame of a moving one.
 #[derive(Clone, Debug)]
-pub struct CameraView {
+pub(crate) struct CameraView {
     /// Its name in messages.
     pub name: String,
     /// Pixels across and down, of the images that features are from.
@@ -85,7 +85,7 @@ pub struct CameraView {
     pub frame: f64,
     /// In the order of times; those without a descriptor are last.
     pub features: Vec<Feature>,
-    /// How many have no descriptor: a [`Matcher`](super::learned::Matcher) found them.
+    /// How many have no descriptor: a matcher found them.
     pub learned: usize,
     /// Source of each time's features, by the time's number; none of a lens that is known, whose features were
     /// straightened.

@@ -125,7 +125,7 @@ struct Blank {
     learned: Option<Learned>,
 }
 
-/// A matcher that recognises cameras by their grey, and knows what they see.
+/// A matcher that recognises cameras by their grey and has the positions of what they see.
 struct Oracle {
     rig: Rig,
     /// Share of matches that are added and wrong.

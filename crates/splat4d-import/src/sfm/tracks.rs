@@ -24,7 +24,7 @@ const TOLERANCE: f64 = 3.0;
 
 /// Two sights and the features that they share.
 #[derive(Clone, Debug)]
-pub struct Link {
+pub(crate) struct Link {
     /// Numbers of the sights, the lower one first.
     pub sights: [usize; 2],
     /// Numbers of the features and how sure: the smaller the ratio of the best to the second best the better.
@@ -37,7 +37,7 @@ pub struct Link {
 
 /// A point that several sights see.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Track {
+pub(crate) struct Track {
     /// Numbers of the sights, ascending without duplicates, and of their features.
     pub seen: Vec<(usize, usize)>,
 }
@@ -316,7 +316,7 @@ pub(super) fn verified(
 
 /// Joins the matches of all links, surest first, so that no track has two features of one sight. Tracks ascend by their
 /// first features.
-pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
+pub(crate) fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
     // Features of exactly one position are one.
     let mut starts = vec![0];
     let mut place_of: Vec<Vec<usize>> = Vec::with_capacity(sights.len());
