@@ -272,9 +272,14 @@ impl Run {
         if scene.is_file() {
             return Ok(scene);
         }
-        checkpoint::list(&self.path)
-            .pop()
-            .ok_or_else(|| Self::unfinished(&self.path, "the run has no scene and no checkpoint yet"))
+        checkpoint::list(&self.path).pop().ok_or_else(|| {
+            let what = if self.path.join("scene.s4d").is_file() {
+                "the run has a playback file (splat4d view plays it), but no scene yet"
+            } else {
+                "the run has no scene and no checkpoint yet"
+            };
+            Self::unfinished(&self.path, what)
+        })
     }
 
     /// Error: a run that is not finished lacks what a command needs. Who works on it decides what to do about that.
@@ -607,6 +612,10 @@ mod tests {
         let said = opened.scene_file().unwrap_err().to_string();
         assert!(said.contains("No process") && said.contains(resume), "{said}");
         assert!(crate::status::of(&run).unwrap().text().contains(resume));
+        // Of a capture that is followed.
+        std::fs::write(run.join("scene.s4d"), "").unwrap();
+        let followed = opened.scene_file().unwrap_err().to_string();
+        assert!(followed.contains("splat4d view plays it") && followed.contains(resume), "{followed}");
         // Of a process on another machine.
         let owner =
             r#"{"command": "train", "process": 7, "host": "elsewhere", "since": "2026", "machine": "m", "beat": "1"}"#;
