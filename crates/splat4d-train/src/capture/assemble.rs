@@ -8,7 +8,9 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawCapture, RawFrame,
     Rig, Split, Timing,
 };
-use super::{borders, computed, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter};
+use super::{
+    borders, computed, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig, shutter, vignetting,
+};
 use rayon::prelude::*;
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
@@ -78,6 +80,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
         .collect();
     shutter::find_motion(&mut frames, &cameras);
     take.notes.extend(shutter::notes(&frames));
+    take.notes.extend(vignetting::notes(&frames));
     let name = take.name.unwrap_or_else(|| {
         let full = std::path::absolute(&take.root).unwrap_or_else(|_| take.root.clone());
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
@@ -210,6 +213,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         tracks: raw.tracks,
         recorded: None,
         shutter: None,
+        vignetting: raw.vignetting,
     }
 }
 

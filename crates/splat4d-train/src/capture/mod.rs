@@ -55,6 +55,7 @@ mod store;
 mod stray;
 mod tracks;
 mod transforms;
+mod vignetting;
 
 pub use account::{Aspect, Remark, Severity};
 pub(crate) use arriving::{frame_files, growing_root};
@@ -77,6 +78,7 @@ pub use sequence::Timing;
 pub use shutter::Shutter;
 pub use store::{ImageStore, Picture, StoredPicture};
 pub use tracks::Tracks;
+pub use vignetting::Vignetting;
 
 use account::Account;
 use splat4d::Result;
@@ -176,6 +178,8 @@ pub struct Frame {
     pub recorded: Option<Arc<Vec<u8>>>,
     /// Its rolling shutter and exposure; `None`: all rows are of its time.
     pub shutter: Option<Shutter>,
+    /// Vignetting that is removed from its image.
+    pub vignetting: Option<Vignetting>,
 }
 
 /// One camera of the rig, or one moving camera.
@@ -354,6 +358,7 @@ struct RawFrame {
     tracks: Option<Arc<Tracks>>,
     /// Readout and exposure, seconds, as stated.
     shutter: [Option<f64>; 2],
+    vignetting: Option<Vignetting>,
     split: Split,
 }
 
@@ -373,6 +378,7 @@ impl RawFrame {
             features: None,
             tracks: None,
             shutter: [None; 2],
+            vignetting: None,
             split: Split::Train,
         }
     }

@@ -7,8 +7,8 @@ use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_cloud;
 use super::{
-    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, Geometry, HoldOut, RawCapture, RawFrame, Tracks, pose,
-    shutter,
+    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, Geometry, HoldOut, RawCapture, RawFrame, Tracks,
+    Vignetting, pose, shutter,
 };
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -54,6 +54,7 @@ const CAMERA_KEYS: &[&str] = &[
     "time_offset",
     "readout",
     "exposure_time",
+    "vignetting",
     "times",
     "images",
     "masks",
@@ -321,6 +322,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     };
     let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
     let shutter = [read_shutter(node, "readout")?, read_shutter(node, "exposure_time")?];
+    let vignetting = node.opt("vignetting")?.map(|n| read_vignetting(&n)).transpose()?.flatten();
     let times = node.opt("times")?.map(|n| read_times(&n)).transpose()?;
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
@@ -418,6 +420,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             labels: beside(&labels)?,
             features: beside(&features)?,
             shutter,
+            vignetting,
             ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
@@ -491,6 +494,17 @@ fn read_times(node: &Node<'_>) -> Result<Vec<f64>> {
 fn read_shutter(node: &Node<'_>, key: &str) -> Result<Option<f64>> {
     let read = |n: Node<'_>| shutter::checked(key, n.number()?).map_err(|e| n.at(e));
     node.opt(key)?.map(read).transpose()
+}
+
+/// A camera's vignetting: up to three coefficients.
+fn read_vignetting(node: &Node<'_>) -> Result<Option<Vignetting>> {
+    let values = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
+    let mut k = [0.0; 3];
+    if values.len() > k.len() {
+        return Err(node.error(format!("there are {} coefficients, more than 3", values.len())));
+    }
+    k[..values.len()].copy_from_slice(&values);
+    Vignetting::new(k).map_err(|e| node.at(e))
 }
 
 fn read_lens(node: &Node<'_>) -> Result<Lens> {

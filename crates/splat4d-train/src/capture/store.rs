@@ -400,7 +400,8 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let flow = frame.flow.as_ref().map(|f| flow::read(f, frame, capture)).transpose().map_err(place)?;
     let lens = Distortion::new(frame.source.lens);
     let opaque = raster.alpha().is_none_or(|a| (0..raster.width * raster.height).all(|p| raster.get(p, a) >= 1.0));
-    if let (true, true, 1, Samples::Eight(samples)) = (opaque, lens.is_pinhole(), capture.downscale, &raster.samples) {
+    let unchanged = opaque && lens.is_pinhole() && frame.vignetting.is_none();
+    if let (true, 1, Samples::Eight(samples)) = (unchanged, capture.downscale, &raster.samples) {
         let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
         let color = Samples::Eight(planar(samples, raster.channels));
         let valid = frame.recorded.as_ref().map(|r| r.iter().map(|&v| v * u8::MAX).collect());
@@ -410,6 +411,9 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let (stored_width, stored_height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
     drop(raster);
+    if let Some(vignetting) = frame.vignetting {
+        vignetting.remove(&mut planes, stored_width, stored_height);
+    }
     planes.extend(mask);
     let mut valid: Option<Vec<f32>> = frame.recorded.as_ref().map(|r| r.iter().map(|&v| f32::from(v)).collect());
     if !lens.is_pinhole() {

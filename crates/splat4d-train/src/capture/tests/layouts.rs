@@ -390,6 +390,37 @@ fn near_is_a_share_of_the_extent_and_never_hides_points() {
 }
 
 #[test]
+fn stated_vignetting_is_removed_from_images() {
+    let sample = samples::own();
+    let load = |capture: Capture| {
+        let (first, other) = (0, capture.frames.iter().position(|f| f.camera == 1).unwrap());
+        let store = ImageStore::new(Arc::new(capture), 0);
+        [first, other].map(|frame| store.load(frame).unwrap().to_picture().color)
+    };
+    let before = load(open(&sample));
+    sample.edit("capture.json", |v| v["cameras"][0]["vignetting"] = json!([-0.3, 0.1]));
+    let capture = open(&sample);
+    assert!(capture.notes.iter().any(|note| note.contains("vignetting is removed") && note.ends_with(": 1.")));
+    let after = load(capture);
+    assert_eq!(after[1], before[1], "the other camera has none");
+    let (width, height) = (after[0].width, after[0].height);
+    let gain = |x: usize, y: usize| f64::from(after[0].get(0, y, x) / before[0].get(0, y, x));
+    let half = (0.5 * width as f64).hypot(0.5 * height as f64);
+    for (x, y) in
+        [(0, 0), (width - 1, 0), (width / 2, height / 2)].into_iter().filter(|&(x, y)| before[0].get(0, y, x) < 0.8)
+    {
+        let r2 = ((x as f64 + 0.5 - 0.5 * width as f64).hypot(y as f64 + 0.5 - 0.5 * height as f64) / half).powi(2);
+        let expected = (1.0 - 0.3 * r2 + 0.1 * r2 * r2).powf(-1.0 / 2.2);
+        assert!((gain(x, y) - expected).abs() < 1e-3, "({x}, {y}): {} for {expected}", gain(x, y));
+    }
+    for wrong in [json!([-0.95]), json!([0.1, 0.1, 0.1, 0.1]), json!("strong")] {
+        sample.edit("capture.json", |v| v["cameras"][0]["vignetting"] = wrong.clone());
+        let refused = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();
+        assert!(refused.contains("vignetting"), "{refused}");
+    }
+}
+
+#[test]
 fn shutters_of_cameras_are_read_and_moving_cameras_have_their_velocity() {
     let sample = samples::own();
     sample.edit("capture.json", |v| {
