@@ -258,9 +258,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(iteration) = trained.iteration {
         watched.show(run, iteration);
     }
-    if args.chunk.is_none() {
-        console.next("view", run);
-    }
+    console.next(if args.chunk.is_some() { "status" } else { "view" }, run);
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if trained.iteration.is_some() && watched.is_on() && console.terminal() {
         console.print_line("the player keeps running until Ctrl-C");
