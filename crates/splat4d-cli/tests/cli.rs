@@ -63,6 +63,15 @@ fn json_of(path: &Path) -> Value {
 
 #[test]
 fn help_has_examples_and_completions_complete() {
+    // No line of settings or of an example is broken where that would hide its meaning.
+    let settings = splat4d(&["train", "--help"]).run().ok();
+    let (_, settings) = settings.split_once("--help-knobs: all):\n").expect("a list of settings");
+    let is_name = |line: &str| line.starts_with("  ") && line.trim().split(' ').next().unwrap().contains('.');
+    let mut lines = settings.lines().filter(|line| !line.is_empty());
+    assert!(lines.all(|line| line.starts_with("      ") || is_name(line)), "{settings}");
+    let render = splat4d(&["render", "--help"]).run().ok();
+    let matrix = "     \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}\n";
+    assert!(render.contains(matrix), "{render}");
     let help = splat4d(&["--help"]).run().ok();
     for verb in [
         "import",
@@ -239,6 +248,17 @@ fn a_capture_is_trained_evaluated_and_exported() {
     assert!(told["scene"]["gaussians"].as_u64().unwrap() > 10);
     let told = splat4d(&["info", str(&capture)]).run().ok();
     assert!(told.contains("4 fixed") && told.contains("16 at 4 times") && told.contains("cam0"), "{told}");
+
+    // The next command to type ends every command that has one.
+    let last = |args: &[&str], next: &str, path: &Path| {
+        let said = splat4d(args).run().ok();
+        assert_eq!(said.lines().last(), Some(&*format!("next: splat4d {next} {}", path.display())), "{said}");
+    };
+    let (file, edited) = (work.path().join("scene.spz"), work.path().join("cut.s4d"));
+    last(&["info", str(&run)], "view", &run);
+    last(&["eval", str(&run), "--split", "train"], "view", &run);
+    last(&["convert", str(&run), str(&file), "--time", "0"], "view", &file);
+    last(&["edit", str(&run), "--delete", "size(9, 99)", "-o", str(&edited)], "view", &edited);
 
     // render
     let frames = work.path().join("frames");

@@ -12,6 +12,8 @@ export const FOV_RANGE = [5, 120];
 const TALL_SHARE = 0.75;
 /** Where the first view is examined for what the capture's cameras saw: shares of the distance to the target, and tangents from its axis. */
 const SEEN_AT = [0.5, 0.7, 1, 1.5, 2.2], SEEN_ACROSS = [-0.25, 0, 0.25], SEEN_STEP = 0.02, SEEN_MOST = 2;
+/** Cameras that show where a point is; a single one leaves its depth open, and what it alone saw is blurred elsewhere. */
+const SEEN_BY = 2;
 /** Below this a cross product has no direction: eye, target and up are on one line. */
 const PARALLEL = 1e-9;
 
@@ -99,7 +101,7 @@ export class Camera {
   lens = null;
   /** 1: a first view, which comes nearer in a tall window, until the viewer moves; 0: not; between, in transition. */
   first = 0;
-  /** Of a first view: the highest and lowest row that a camera saw, tangents from its axis, down positive; null: unknown. */
+  /** Of a first view: the highest and lowest row that two cameras saw, tangents from its axis, down positive; null: unknown. */
   seen = null;
   /** How far the axis is above the middle of a tall window, tangent; set when a first view is moved. */
   lift = 0;
@@ -212,9 +214,9 @@ export const firstCamera = meta => {
   return Object.assign(camera, { first: 1, seen: seenRows(camera, meta?.cameras ?? []) });
 };
 
-/** The highest and lowest row of a view in which a camera of the capture saw something, tangents from its axis; null: there are no two cameras. */
+/** The highest and lowest row of a view in which two cameras of the capture saw something, tangents from its axis; null: there are no two cameras. */
 function seenRows(camera, cameras) {
-  if (cameras.length < 2) return null;
+  if (cameras.length < SEEN_BY) return null;
   const { position, right, down, forward, distance } = camera;
   const sees = (c, p) => {
     const m = c.world_from_camera, d = [p[0] - m[3], p[1] - m[7], p[2] - m[11]];
@@ -224,7 +226,7 @@ function seenRows(camera, cameras) {
   };
   const isSeen = row => SEEN_AT.some(share => SEEN_ACROSS.every(x => {
     const ray = add(add(forward, right, x), down, row), p = add(position, ray, share * distance);
-    return cameras.some(c => sees(c, p));
+    return cameras.filter(c => sees(c, p)).length >= SEEN_BY;
   }));
   const end = sign => {
     let row = 0;

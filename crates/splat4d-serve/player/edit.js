@@ -84,6 +84,9 @@ const slider = (label, low, high, value, onchange, oninput) => {
   return node;
 };
 
+/** The program refuses a list. Other errors of a request are of the connection, which also breaks when a page is left. */
+class Refusal extends Error {}
+
 /** One editing page. `ui`: the player's face; `token`: the leave that the page's address brought. */
 export class Editing {
   #timers = {};
@@ -123,7 +126,7 @@ export class Editing {
       const answer = await fetch(this.address, { method: 'POST', body: JSON.stringify(body),
         headers: { 'content-type': 'application/json', 'x-splat4d-token': this.token } });
       const told = answer.headers.get('content-type')?.includes('json') ? await answer.json() : { error: await answer.text() };
-      if (!answer.ok) throw new Error(told.error);
+      if (!answer.ok) throw new Refusal(told.error);
       return told;
     } finally {
       this.#busy--;
@@ -595,7 +598,9 @@ export class Editing {
       if (run !== this.#run || stale) return;
       await this.player.load(new URL(`scene.s4d?v=${version}`, document.baseURI).href, { keep: true });
     } catch (error) {
-      if (run === this.#run) this.#refused(error);
+      if (run !== this.#run) return;
+      if (error instanceof Refusal) this.#refused(error);
+      else this.say(`No answer from the program: ${error.message}. The edits stay in this tab; change or undo one to try again.`, true);
     }
     if (run !== this.#run) return;
     this.#standing = false;

@@ -1,6 +1,7 @@
 //! Compares runs and results of other programs, and checks whether their scores are comparable.
 
 use crate::files::grouped;
+use crate::playable;
 use crate::run_folder::{Metrics, Run, ViewScore, newest, view_scores};
 use serde_json::Value;
 use splat4d::{Error, Result};
@@ -69,7 +70,9 @@ impl Entry {
 
     fn of_run(run: &Run) -> Option<Self> {
         let results = run.results.as_ref()?;
-        let bytes = run.number("playback_bytes").map(|b| b as u64);
+        // A compression writes the file by itself and records no size of a baked one.
+        let file = || run.path.join(playable::FILE).metadata().ok().map(|file| file.len());
+        let bytes = run.number("playback_bytes").map(|b| b as u64).or_else(file);
         Some(Self {
             // Runs of one capture differ in their folders.
             name: folder_name(&run.path).unwrap_or_else(|| run.name()),

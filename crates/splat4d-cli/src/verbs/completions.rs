@@ -30,8 +30,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 fn completed() -> clap::Command {
     let settings = Recipe::settings();
     let models = settings.iter().find(|k| k.key() == "run.motion").map(|k| k.choices.clone()).unwrap_or_default();
-    // Words of a command need a static lifetime.
-    let settings: Vec<&'static str> = settings.iter().map(|k| &*format!("{}=", k.key()).leak()).collect();
+    // Settings have a long name and most of them a short one. Words of a command need a static lifetime.
+    let long = settings.iter().map(|k| format!("{}=", k.key()));
+    let short = settings.iter().filter_map(|k| Recipe::flat_name(&k.key()).map(|name| format!("{name}=")));
+    let settings: Vec<&'static str> = long.chain(short).map(|word| &*word.leak()).collect();
     let with_settings =
         |verb: clap::Command| verb.mut_arg("set", |a| a.value_parser(PossibleValuesParser::new(settings.clone())));
     crate::command()
@@ -51,7 +53,7 @@ mod tests {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut completed(), "splat4d", &mut script);
             let script = String::from_utf8(script).unwrap();
-            for word in ["deform-mlp", "run.iterations=", "densify.max_cap=", "auto"] {
+            for word in ["deform-mlp", "run.iterations=", "densify.max_cap=", "lambda_dssim=", "auto"] {
                 assert!(script.contains(word), "{shell}: {word}");
             }
         }

@@ -98,7 +98,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "fine-tuning", console));
     let stop = interrupt::flag("stopping");
-    work.run(!args.no_eval, &args.measure.options(), &stop, console)?;
+    let dir = work.run(!args.no_eval, &args.measure.options(), &stop, console)?;
+    console.next("view", &dir);
     Ok(())
 }
 

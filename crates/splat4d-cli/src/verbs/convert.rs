@@ -164,5 +164,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         spz_version: args.spz_version,
         program: args.program.as_deref().and_then(Program::of),
     };
-    Ok(converting::run(&conversion, console)?)
+    converting::run(&conversion, console)?;
+    if !conversion.frames {
+        console.next("view", &conversion.output);
+    }
+    Ok(())
 }

@@ -88,5 +88,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         no_provenance: args.no_provenance,
         save: args.save.clone(),
     };
-    Ok(edit(&options, console)?)
+    edit(&options, console)?;
+    options.output.iter().for_each(|output| console.next("view", output));
+    Ok(())
 }

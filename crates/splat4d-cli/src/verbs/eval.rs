@@ -136,7 +136,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             measured: args.split.unwrap_or(Split::Test).measured(),
             backgrounds: args.background.map_or(&[][..], Background::colors),
         };
-        return Ok(foreign::score(path, capture, &options, &measure, &stop, console)?);
+        foreign::score(path, capture, &options, &measure, &stop, console)?;
+        options.output.iter().for_each(|folder| console.next("compare", folder));
+        return Ok(());
     }
     let run = Run::open(path)?;
     run.scene_file()?;
@@ -148,15 +150,19 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let split = args.split.unwrap_or(Split::Test).measured();
         let backgrounds = args.background.map_or(&[][..], Background::colors);
         evaluating::scores_on(path, split, backgrounds, &measure, &stop, console)?;
-        return Ok(evaluating::write_page(path, console)?);
+        evaluating::write_page(path, console)?;
+    } else {
+        if args.baseline {
+            baseline(&folder, &run, &measure, &stop, console)?;
+        }
+        if args.no_film {
+            let scene = read_scene(&run.scene_file()?)?;
+            evaluating::scores(path, &scene, &measure, &stop, console)?;
+            evaluating::write_report(path, console)?;
+        } else {
+            evaluating::all(path, &measure, &Deadline::default(), &stop, console)?;
+        }
     }
-    if args.baseline {
-        baseline(&folder, &run, &measure, &stop, console)?;
-    }
-    if args.no_film {
-        let scene = read_scene(&run.scene_file()?)?;
-        evaluating::scores(path, &scene, &measure, &stop, console)?;
-        return Ok(evaluating::write_report(path, console)?);
-    }
-    Ok(evaluating::all(path, &measure, &Deadline::default(), &stop, console)?)
+    console.next("view", path);
+    Ok(())
 }

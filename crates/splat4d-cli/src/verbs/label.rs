@@ -33,5 +33,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag("stopping");
     interrupt::stop_not_polled("the same command begins again");
     let rounds = args.rounds.map(usize::from);
-    Ok(labelling::label(&args.run, args.from.as_deref(), rounds, &stop, console)?)
+    labelling::label(&args.run, args.from.as_deref(), rounds, &stop, console)?;
+    console.next("view", &args.run);
+    Ok(())
 }

@@ -92,6 +92,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let stop = interrupt::flag("stopping");
     interrupt::stop_not_polled("the same command begins again");
-    predict(options, &stop, console)?;
+    let folder = predict(options, &stop, console)?;
+    console.next("view", &folder.join("scene.s4d"));
     Ok(())
 }

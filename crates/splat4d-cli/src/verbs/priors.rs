@@ -75,12 +75,13 @@ fn compute(args: &Args, capture: PathBuf, console: &Console) -> anyhow::Result<(
         Part::ALL.into_iter().zip(given).filter_map(|(part, path)| Some((part, path.clone()?))).collect();
     let described = args.described.iter().map(|name| Ok((part_of(name)?, name.clone()))).collect::<Result<_>>()?;
     let stop = interrupt::flag("stopping");
-    let made = priors(&Priors { capture, networks, described, force: args.force }, &stop, console)?;
+    let made = priors(&Priors { capture: capture.clone(), networks, described, force: args.force }, &stop, console)?;
     if console.json() {
         console.emit(&made.json());
     } else {
         console.result(&made.text());
         console.result(&format!("wrote {}; `train` uses it", made.folder.display()));
+        console.next("train", &capture);
     }
     Ok(())
 }

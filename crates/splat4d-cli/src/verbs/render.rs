@@ -27,10 +27,14 @@ Examples:
 
 The output's extension selects the format: .mp4 (needs ffmpeg), .png (animated if it has several frames), .exr, none: a \
 folder of PNGs. NAME.%04d.png and NAME.%04d.exr are numbered files. A key frame file is
-  {\"fps\": 30, \"keys\": [{\"time\": 0, \"position\": [0, 1, 4], \"look_at\": [0, 1, 0], \"fov_y\": 45, \"scene_time\": 0},
-                       {\"time\": 3, \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}
+  {\"fps\": 30, \"keys\": [
+    {\"time\": 0, \"position\": [0, 1, 4], \"look_at\": [0, 1, 0], \"fov_y\": 45,
+     \"scene_time\": 0},
+    {\"time\": 3,
+     \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}
 and a camera file
-  {\"fx\": 500, \"fy\": 500, \"cx\": 320, \"cy\": 240, \"w\": 640, \"h\": 480, \"background\": [0, 0, 0],
+  {\"fx\": 500, \"fy\": 500, \"cx\": 320, \"cy\": 240, \"w\": 640, \"h\": 480,
+   \"background\": [0, 0, 0],
    \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
 with a row-major pose in OpenCV axes (x right, y down, z forward) and pixel centres at +0.5.";
 

@@ -258,9 +258,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(iteration) = trained.iteration {
         watched.show(run, iteration);
     }
-    if args.chunk.is_none() {
-        console.next("view", run);
-    }
+    console.next(if args.chunk.is_some() { "status" } else { "view" }, run);
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if trained.iteration.is_some() && watched.is_on() && console.terminal() {
         console.print_line("the player keeps running until Ctrl-C");
@@ -351,7 +349,8 @@ fn long_help() -> String {
     let settings = Recipe::settings();
     let lines: String = IMPORTANT
         .iter()
-        .map(|key| line(settings.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe")))
+        .map(|key| settings.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe"))
+        .map(|setting| format!("  {}\n      {}\n", names(setting), meaning(setting)))
         .collect();
     format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
@@ -382,15 +381,24 @@ fn setting_list(topic: &str) -> Result<String, Error> {
     Ok(text)
 }
 
-/// A setting in a line of help: its names, meaning, unit and default.
+/// A setting in one line: its names, meaning, unit and default.
 fn line(setting: &Setting) -> String {
-    let default = if setting.default == "\"\"" { "empty" } else { &setting.default };
-    let unit = if setting.rule.unit.is_empty() { String::new() } else { format!(" {}", setting.rule.unit) };
+    format!("  {:<42} {}\n", names(setting), meaning(setting))
+}
+
+/// The key of a setting, and the name by which it is also known.
+fn names(setting: &Setting) -> String {
     let alone = Recipe::flat_name(&setting.key())
         .filter(|n| *n != setting.field)
         .map_or_else(String::new, |n| format!(" ({n})"));
-    let name = format!("{}{alone}", setting.key());
-    format!("  {name:<42} {} [{default}{unit}]\n", setting.doc.trim_end_matches('.'))
+    format!("{}{alone}", setting.key())
+}
+
+/// The meaning, unit and default of a setting.
+fn meaning(setting: &Setting) -> String {
+    let default = if setting.default == "\"\"" { "empty" } else { &setting.default };
+    let unit = if setting.rule.unit.is_empty() { String::new() } else { format!(" {}", setting.rule.unit) };
+    format!("{} [{default}{unit}]", setting.doc.trim_end_matches('.'))
 }
 
 #[cfg(test)]

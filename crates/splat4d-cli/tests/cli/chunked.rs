@@ -42,7 +42,8 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         ("1", ["done", "done", "done"]),
         ("1", ["done", "done", "done"]),
     ] {
-        train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
+        let said = train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
+        assert_eq!(said.lines().last(), Some(&*format!("next: splat4d status {}", parts.display())), "{said}");
         // Its present part plays, and an older reader refuses it by its version.
         let bytes = std::fs::read(&film).unwrap();
         assert_eq!(bytes[8..12], [2, 0, 0, 0], "{part}");

@@ -21,6 +21,10 @@ fn a_run_is_compressed_and_measured_before_and_after() {
     let file = std::fs::read(dir.join("scene.s4d")).unwrap();
     assert_eq!(told["after"]["bytes"].as_u64(), Some(file.len() as u64), "the size told is the file's");
     assert_eq!(last["bytes"].as_u64(), Some(file.len() as u64));
+    let table = work.path().join("table.csv");
+    splat4d(&["compare", str(&run), str(&dir), "-o", str(&table)]).run().ok();
+    let rows = std::fs::read_to_string(&table).unwrap();
+    assert!(rows.lines().last().unwrap().contains(&format!(",{},", file.len())), "{rows}");
     let gaussians = |side: &str| told[side]["gaussians"].as_u64().unwrap();
     assert_eq!(gaussians("unpruned"), gaussians("before"));
     assert!(gaussians("after") <= gaussians("before").div_ceil(2), "half is gone");

@@ -107,7 +107,8 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
             );
         }
     }
-    if let Some(g) = grade(s.blocks, BLOCKS) {
+    // Reduced images have their blocks at other distances.
+    if let Some(g) = grade(s.blocks, BLOCKS).filter(|_| capture.downscale == 1) {
         let what = format!("Camera {name} is compressed hard: its images have edges every 8 pixels.");
         told.add(
             (g, "compression"),

@@ -238,16 +238,23 @@ fn dark_and_clipped_images_are_found() {
     is_found(&with(|_, p| times(p, [3.0; 3])), "clipped");
 }
 
+/// Edges every `side` pixels.
+fn in_blocks(p: &mut Rgb8, side: usize) {
+    let (from, w) = (p.clone(), p.width);
+    let block = |i: usize| ((i / 3 / w) / side * side * w + (i / 3 % w) / side * side) * 3 + i % 3;
+    (0..p.data.len()).for_each(|i| p.data[i] = from.data[block(i)]);
+}
+
 #[test]
 fn hard_compression_is_found() {
-    is_found(
-        &with(|_, p| {
-            let (from, w) = (p.clone(), p.width);
-            let block = |i: usize| ((i / 3 / w) / 8 * 8 * w + (i / 3 % w) / 8 * 8) * 3 + i % 3;
-            (0..p.data.len()).for_each(|i| p.data[i] = from.data[block(i)]);
-        }),
-        "compression",
-    );
+    is_found(&with(|_, p| in_blocks(p, 8)), "compression");
+    // Edges of images that are reduced were at other places.
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &with(|_, p| in_blocks(p, 16)), 0.0, CAMERAS);
+    let options = CaptureOptions { downscale: 2, ..CaptureOptions::default() };
+    let capture = Capture::open(folder.path(), &options).unwrap();
+    let report = examine(&capture, &Options::default(), &mut Progress(&mut |_| {})).unwrap();
+    assert_eq!(found(&report, "compression"), [""; 0], "{:#?}", report.findings);
 }
 
 #[test]

@@ -295,6 +295,20 @@ test('after a reload unsaved edits are in the list; another page begins with wha
   await page.keyboard.press('Control+z');
   await e.idle();
   assert.deepEqual([await e.gaussians(), await e.steps()], [whole, []]);
+  // The same while the program still works on the edit: the reload breaks the request off.
+  let held = true;
+  await page.route('**/edit', (route) => (held && route.request().postData().includes('"bake"') ? null : route.continue()));
+  await area.fill('box(-99,-99,-99, 0,99,99)');
+  await area.blur();
+  await page.waitForFunction(() => /Gaussians/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
+  const asked = page.waitForRequest((request) => request.postData()?.includes('"bake"'));
+  await e.act('Delete');
+  await asked;
+  await page.reload();
+  held = false;
+  await panel.waitFor({ timeout: PATIENCE });
+  await e.idle();
+  assert.deepEqual([await e.gaussians(), (await e.steps()).length], [less, 1]);
   assert.deepEqual([e.errors, other.errors], [[], []]);
   await page.close();
 });

@@ -453,6 +453,10 @@ test('the first view of a tall window shows as little as possible of what no cam
   const away = firstCamera({ ...meta, view: { position: [0, 1.6, 5.8], target: [0, 1.6, 20] } }).view(width, height);
   assert.ok(away.cy >= height / 4 && away.cy <= 3 * height / 4, `${away.cy}`);
   near(first.set({ position: [0, 0, 4] }).view(width, height).cy, height / 2);
+  // What a single camera saw above the others does not count: its depth is unknown.
+  const high = { ...meta.cameras[3], cy: 300 };
+  const highest = more => firstCamera({ ...meta, cameras: [...meta.cameras, ...more] }).seen[0];
+  assert.ok(highest([high, high]) < highest([high]) - 0.1, `${highest([high, high])} ${highest([high])}`);
 });
 
 test('a page without permission to edit loads no editor', options, async () => {

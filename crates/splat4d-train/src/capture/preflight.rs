@@ -29,6 +29,9 @@ const FAR_CLOCK: f64 = 1e4;
 const PATH: (usize, f64) = (10, 3.0);
 /// Gaps between times may differ by this factor before the clock is called uneven.
 const UNEVEN: f64 = 1.5;
+/// Share of a frame's duration below which two times count as one: cameras that run together differ by that much once
+/// their time offsets are measured.
+const SAME_TIME: f64 = 0.05;
 /// Angle and relative distance below which two cameras add little to each other.
 const CLOSE_DEGREES: f64 = 0.5;
 
@@ -178,13 +181,14 @@ impl Capture {
     }
 
     fn check_clock(&self, findings: &mut Vec<Finding>) {
-        let times = self.times();
+        let mut times = self.times();
         if let Some(first) = times.first().filter(|first| first.abs() > FAR_CLOCK) {
             let what = format!("The first image is at {first} s: f32 lifespans resolve milliseconds no more there.");
             findings.push(finding(Severity::Warning, what, "Give times from the start of the clip."));
         }
         self.check_ranges(findings);
         self.check_paths(findings);
+        times.dedup_by(|later, earlier| *later - *earlier < SAME_TIME / self.fps);
         let gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
         let (low, high) = gaps.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &g| (l.min(g), h.max(g)));
         if !self.fixed_cameras() || gaps.len() < 2 || high <= UNEVEN * low {

@@ -16,7 +16,8 @@
 //! that suits all measured views of the image's camera best: what remains is not a matter of white balance. It is
 //! reported next to the plain one and never instead of it, for it has seen the truth. The dynamic region (pixels that
 //! leave their
-//! camera's temporal mean) and flicker are defined for fixed cameras only. Where an image was undistorted, pixels
+//! camera's temporal mean) and flicker are defined for fixed cameras only. `PSNR-dynamic-still` is that of this mean in
+//! place of the render: what a static image of the camera reaches. Where an image was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.
 
 use super::align::Align;
@@ -438,7 +439,12 @@ impl<'a> Judge<'a> {
             dynamic: dynamic.as_deref(),
             lpips: self.lpips.as_ref().map(|l| (l, InputScaling::Signed)),
         };
-        Ok(Drawn { view: score_view(name, &image, &truth, &context), image, truth, sums })
+        let mut view = score_view(name, &image, &truth, &context);
+        if let (Some(mean), Some(region)) = (mean, &dynamic) {
+            let still = metrics::psnr_region(mean, &truth, region);
+            view.set("PSNR-dynamic-still", Score::or(still, "not defined: no pixel moves"));
+        }
+        Ok(Drawn { view, image, truth, sums })
     }
 }
 

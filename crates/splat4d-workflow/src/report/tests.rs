@@ -88,6 +88,21 @@ fn the_report_is_complete_and_self_contained() {
 }
 
 #[test]
+fn without_a_trained_baseline_the_verdict_compares_with_static_images() {
+    let folder = tempfile::tempdir().unwrap();
+    fill(folder.path());
+    let file = folder.path().join("results.json");
+    let mut results: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    results.as_object_mut().unwrap().remove("still");
+    results["ours_6000"]["PSNR-dynamic-still"] = json!(20.1);
+    std::fs::write(&file, results.to_string()).unwrap();
+    let html = std::fs::read_to_string(write(&Run::open(folder.path()).unwrap()).unwrap()).unwrap();
+    assert!(
+        html.contains("26.10 dB, 6.00 dB better than a static image of each camera") && html.contains("--baseline")
+    );
+}
+
+#[test]
 fn a_run_that_has_just_begun_gets_a_page_too() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("recipe.toml"), "").unwrap();

@@ -79,6 +79,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         (true, false) => "looks healthy",
     };
     console.report(&format!("{}{verdict}", found.text), healthy);
+    let next = match found.json["type"].as_str() {
+        Some("capture") => Some("train"),
+        Some("run") if found.json["scene"].is_null() => None,
+        Some("run" | "scene" | "playback" | "ply") => Some("view"),
+        _ => None,
+    };
+    next.filter(|_| healthy).iter().for_each(|verb| console.next(verb, &args.path));
     args.verdict(healthy)
 }
 
