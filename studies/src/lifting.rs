@@ -2,7 +2,7 @@
 //! of 20 frames is lifted with the depth of one frame and added up. It beats repeating frame 0 by far, and drifts:
 //! turning moves points along the viewing direction, which flow with one depth does not see.
 
-use splat4d::flow::lift::{Integrator, drift, growth, integrate, lift, lift_in_plane};
+use splat4d::flow::lift::lift;
 use splat4d::math::{Rng, Se3};
 use splat4d::scene::Camera;
 use splat4d::scene::camera::{Intrinsics, Lens};
@@ -122,9 +122,7 @@ pub(crate) fn run(s: &Settings) -> Findings {
         exact.push(both);
     }
     let follow = |flows: &[Vec<[f64; 3]>]| -> Vec<Vec<[f64; 3]>> {
-        let track = |(path, flow): (&Vec<[f64; 3]>, &Vec<[f64; 3]>)| {
-            integrate(path[0], s.frames - 1, Integrator::Euler, |n, _| flow[n as usize])
-        };
+        let track = |(path, flow): (&Vec<[f64; 3]>, &Vec<[f64; 3]>)| integrate(path[0], s.frames - 1, |n, _| flow[n]);
         truth.iter().zip(flows).map(track).collect()
     };
     let still: Vec<Vec<[f64; 3]>> = truth.iter().map(|path| vec![path[0]; s.frames]).collect();
@@ -164,6 +162,48 @@ pub(crate) fn run(s: &Settings) -> Findings {
         both_depths_drift: both,
         fitted_drift: fitted,
     }
+}
+
+/// The same where the second depth is not known: the point is taken to keep its distance from the camera's plane, so that
+/// motion along the viewing direction is missing. The camera is static.
+fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f64) -> [f64; 3] {
+    lift(camera, camera, pixel, flow, depth, depth)
+}
+
+/// Follows `field(step, x)` (displacement of one step at x) from `start` by Euler's rule: positions at steps 0 to `steps`.
+fn integrate(start: [f64; 3], steps: usize, field: impl Fn(usize, [f64; 3]) -> [f64; 3]) -> Vec<[f64; 3]> {
+    let mut out = vec![start];
+    for n in 0..steps {
+        let (x, v) = (out[n], field(n, out[n]));
+        out.push(std::array::from_fn(|k| x[k] + v[k]));
+    }
+    out
+}
+
+/// Root mean square distance at every step between tracks \[points\]\[steps\] and the truth.
+fn drift(tracks: &[Vec<[f64; 3]>], truth: &[Vec<[f64; 3]>]) -> Vec<f64> {
+    assert_eq!(tracks.len(), truth.len(), "a track a true track is needed");
+    let steps = truth.iter().map(Vec::len).min().unwrap_or(0);
+    let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
+    (0..steps)
+        .map(|n| {
+            let sum: f64 = tracks.iter().zip(truth).map(|(a, b)| square(a[n], b[n])).sum();
+            (sum / truth.len().max(1) as f64).sqrt()
+        })
+        .collect()
+}
+
+/// How an error grows: the slope of log error over log step by least squares, steps from 1 on. ½ is a random walk (noise
+/// that averages out), 1 a bias that adds up. `None`: fewer than two steps with an error.
+fn growth(errors: &[f64]) -> Option<f64> {
+    let points: Vec<(f64, f64)> =
+        errors.iter().enumerate().skip(1).filter(|(_, e)| **e > 0.0).map(|(n, e)| ((n as f64).ln(), e.ln())).collect();
+    if points.len() < 2 {
+        return None;
+    }
+    let mean = |f: &dyn Fn(&(f64, f64)) -> f64| points.iter().map(f).sum::<f64>() / points.len() as f64;
+    let (mx, my) = (mean(&|p| p.0), mean(&|p| p.1));
+    Some(mean(&|p| (p.0 - mx) * (p.1 - my)) / mean(&|p| (p.0 - mx).powi(2)))
 }
 
 fn camera() -> Camera {
@@ -307,5 +347,41 @@ mod tests {
         assert!(f.fitted_mse < f.both_depths_mse, "{} {}", f.fitted_mse, f.both_depths_mse);
         assert_eq!(run(&noisy), f, "the same seed, the same numbers");
         assert_ne!(run(&Settings { seed: 1, ..noisy }), f);
+    }
+
+    #[test]
+    fn one_depth_lifts_all_but_motion_along_the_viewing_direction() {
+        let camera = camera();
+        let (x, moved) = ([0.3, -0.2, 4.4], [0.1, 0.05, 0.0]);
+        let ((a, z), (b, _)) =
+            (camera.project(x).unwrap(), camera.project(std::array::from_fn(|k| x[k] + moved[k])).unwrap());
+        let lifted = lift_in_plane(&camera, a, [b[0] - a[0], b[1] - a[1]], z);
+        assert!((0..3).all(|k| (lifted[k] - moved[k]).abs() < 1e-12), "{lifted:?}");
+    }
+
+    #[test]
+    fn integration_spirals_outwards_as_eulers_rule_must() {
+        let w = 0.1;
+        let end = integrate([1.0, 0.0, 0.0], 50, |_, x| [-w * x[1], w * x[0], 0.0])[50];
+        let radius = (end[0] * end[0] + end[1] * end[1]).sqrt();
+        assert!((radius - (1.0f64 + w * w).powf(25.0)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn slopes_distinguish_noise_from_bias() {
+        let rng = Rng::new(3, "walk", 0);
+        let truth = vec![vec![[0.0; 3]; 101]; 2000];
+        let walk = |i: u64| {
+            let noise =
+                |n: usize, _: [f64; 3]| -> [f64; 3] { std::array::from_fn(|k| rng.fork(i).normal((3 * n + k) as u64)) };
+            integrate([0.0; 3], 100, noise)
+        };
+        let walks: Vec<_> = (0..2000).map(walk).collect();
+        let random = growth(&drift(&walks, &truth)).unwrap();
+        assert!((random - 0.5).abs() < 0.1, "{random}");
+        let biased = vec![integrate([0.0; 3], 100, |_, _| [0.01, 0.0, 0.0]); 2000];
+        let bias = growth(&drift(&biased, &truth)).unwrap();
+        assert!((bias - 1.0).abs() < 0.1, "{bias}");
+        assert_eq!(growth(&[0.0, 0.0, 0.0]), None);
     }
 }

@@ -53,7 +53,7 @@
 //! | `run/chunks/` | long captures in chunks: budget, plan, shared layer, training of a chunk, ties to neighbours, join |
 //! | `run/follow/` | captures that are still being filmed: arrival of frames, changed Gaussians, the files of frames, nodes of the playback file |
 //! | `labels.rs`, `features.rs` | labels from masks by expectation-maximisation; feature channels by conjugate gradients |
-//! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of tracks and flow, alignment of held-out cameras, trajectory errors, localisation, floaters, `results.json` and `per_view.json` |
+//! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of flow, alignment of held-out cameras, trajectory errors, floaters, `results.json` and `per_view.json` |
 //! | `compress/`, `compress/quantise/` | settings, rounds of pruning, settings for a size; fine-tuning through the file's quantisation (straight-through) |
 
 #![cfg_attr(docsrs, feature(doc_cfg))] // docs.rs marks what needs a feature

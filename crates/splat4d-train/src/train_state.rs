@@ -8,8 +8,9 @@ mod corrections;
 mod exposure;
 
 pub(crate) use corrections::Scale;
+pub use corrections::moved;
 pub use corrections::{Corrections, RefineSettings};
-pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
+pub(crate) use corrections::{Origin, SearchDue, StepGrads, zoomed};
 pub(crate) use exposure::{COLUMNS as EXPOSURE_COLUMNS, Exposure, expose};
 
 use crate::Result;

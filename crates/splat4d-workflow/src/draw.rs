@@ -5,11 +5,12 @@ mod layers;
 mod panorama;
 mod transfer;
 
+use crate::channels::{self, Witness};
 use crate::events::Listener;
 use crate::paths::View;
 use crate::source::cloud;
 use rayon::prelude::*;
-use splat4d::channels::{self, Witness};
+use splat4d::channels::{feature_columns, label_columns};
 use splat4d::device;
 use splat4d::flow;
 use splat4d::layers::{ALWAYS, Evaluation, Head, Scene};
@@ -327,10 +328,8 @@ impl<'a> Painter<'a> {
             }
             Channel::Velocity => flow::velocity_columns(scene, &self.instant),
             Channel::Normal => channels::normal_columns(&self.instant, camera),
-            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was requested"),
-            Channel::Feature => {
-                channels::feature_columns(scene, &self.instant).expect("a scene with features was requested")
-            }
+            Channel::Label => label_columns(scene, &self.instant).expect("a scene with labels was requested"),
+            Channel::Feature => feature_columns(scene, &self.instant).expect("a scene with features was requested"),
             _ => channels::number_columns(&self.instant, &self.numbers),
         };
         let splats = scene.splats(&self.instant);

@@ -8,6 +8,8 @@ use crate::draw::{Channel, Painter};
 use crate::events::Listener;
 use crate::files::{self, human_seconds};
 use crate::folding::fold;
+use crate::ground_truth::points::point_errors;
+use crate::ground_truth::tracks::track_error;
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
 use crate::playable;
 use crate::report::{self, refined_in_words};
@@ -22,9 +24,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, Timing};
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
-use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{self as eval, EvalOptions, Measured, Scores};
-use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
 use splat4d_train::event::Event;
 use splat4d_train::output::OutputFolder;
@@ -447,7 +447,7 @@ const LIFE_BINS: usize = 10;
 fn lifespans(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
     let length = (scene.clip[1] - scene.clip[0]).max(f64::MIN_POSITIVE);
     let mut counts = [0; LIFE_BINS];
-    for seconds in splat4d::channels::lifetimes(scene).into_iter().flatten().filter(|s| *s > 0.0) {
+    for seconds in crate::channels::lifetimes(scene).into_iter().flatten().filter(|s| *s > 0.0) {
         let share = f64::from(seconds) / length;
         counts[((share * LIFE_BINS as f64) as usize).min(LIFE_BINS - 1)] += 1;
     }

@@ -18,6 +18,7 @@ use splat4d::math::Rng;
 use splat4d::scene::{RowEdit, Rows, Space, Table, Time, labels};
 use splat4d::{Error, Result, format};
 use splat4d_serve::{Page, SceneIn};
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Numbers of a file of tracks, at most: three for a Gaussian and a time. As text they are some gigabytes.
@@ -207,8 +208,8 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     let followed = Tracks::follow(scene, &members, &times);
     let offset = if options.world { scene.offset } else { [0.0; 3] };
     let bytes = match format {
-        TrackFormat::Json => followed.to_json(scene, offset).into_bytes(),
-        TrackFormat::Csv => followed.to_csv(scene, offset).into_bytes(),
+        TrackFormat::Json => as_json(&followed, scene, offset).into_bytes(),
+        TrackFormat::Csv => as_csv(&followed, scene, offset).into_bytes(),
         TrackFormat::Npz => scene_flow(scene, &followed, offset)?,
     };
     files::write(out, &bytes)?;
@@ -216,6 +217,55 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     listener.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     listener.written(out);
     Ok(())
+}
+
+/// Tracks as JSON, `offset` added in f64:
+/// `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
+fn as_json(tracks: &Tracks, scene: &Scene<f32>, offset: [f64; 3]) -> String {
+    let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", tracks.times);
+    for (i, m) in tracks.members.iter().enumerate() {
+        let name = serde_json::Value::from(scene.layers[m.layer].name.as_str());
+        let comma = if i > 0 { "," } else { "" };
+        let _ = write!(out, "{comma}\n{{\"layer\":{name},\"gaussian\":{},\"points\":[", m.row);
+        for (k, point) in tracks.track(i).iter().enumerate() {
+            let comma = if k > 0 { "," } else { "" };
+            let _ = match point {
+                Some(p) => {
+                    let [x, y, z] = placed(*p, offset);
+                    write!(out, "{comma}[{x},{y},{z}]")
+                }
+                None => write!(out, "{comma}null"),
+            };
+        }
+        out.push_str("]}");
+    }
+    out.push_str("\n]}\n");
+    out
+}
+
+/// Tracks as CSV, `offset` added in f64: a header `layer,gaussian,time,x,y,z` and a line for every time at which a
+/// Gaussian is alive.
+fn as_csv(tracks: &Tracks, scene: &Scene<f32>, offset: [f64; 3]) -> String {
+    let mut out = csv::Writer::from_writer(Vec::new());
+    out.write_record(["layer", "gaussian", "time", "x", "y", "z"]).expect("memory takes every row");
+    for (i, m) in tracks.members.iter().enumerate() {
+        let (name, row) = (&scene.layers[m.layer].name, m.row.to_string());
+        for (t, point) in tracks.times.iter().zip(tracks.track(i)) {
+            if let Some(p) = point {
+                let [x, y, z] = placed(*p, offset);
+                out.write_record([name, &row, &t.to_string(), &x, &y, &z]).expect("memory takes every row");
+            }
+        }
+    }
+    String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
+}
+
+/// A position with the offset added in f64, as text; the shortest of f32 where there is none.
+fn placed(p: [f32; 3], offset: [f64; 3]) -> [String; 3] {
+    std::array::from_fn(|k| match offset[k] == 0.0 {
+        true => p[k].to_string(),
+        false => (f64::from(p[k]) + offset[k]).to_string(),
+    })
 }
 
 /// Tracks with their velocities as an .npz: `times` [T] in seconds, `positions` [T, N, 3] in scene units and `velocities` [T, N, 3]
@@ -351,6 +401,9 @@ fn percent(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat4d::layers::Layer;
+    use splat4d::motion::{Spec, build};
+    use splat4d::scene::{LifeKind, Params};
 
     #[test]
     fn a_page_refers_to_its_scene_relative_to_itself() {
@@ -361,5 +414,25 @@ mod tests {
         assert_eq!(address(&at("a b/ü#?.s4d"), &at("page.html")).unwrap(), "./a%20b/%C3%BC%23%3F.s4d");
         assert!(address(&at("x.s4d"), &at("a b/page.html")).is_err(), "browsers would ask above the page");
         assert!(address(&at("none/x.s4d"), &at("page.html")).is_err());
+    }
+
+    #[test]
+    fn tracks_are_written_as_text() {
+        let mut params = Params::new(5, 1, &[]);
+        let motion = build(&Spec::Still, &mut params).unwrap();
+        let layer = Layer::new("a, b", params, motion, LifeKind::Infinite);
+        let scene = Scene { layers: vec![layer], ..Scene::default() };
+        let members = vec![Member { layer: 0, row: 2 }, Member { layer: 0, row: 4 }];
+        let points = vec![Some([2.0, 0.0, 0.0]), Some([2.0, 0.5, 0.0]), Some([4.0, 0.0, 0.0]), None];
+        let tracks = Tracks { times: vec![0.0, 1.0], members, points };
+        let csv = as_csv(&tracks, &scene, [0.0; 3]);
+        assert_eq!(csv.lines().count(), 4, "{csv}");
+        assert!(csv.contains("\n\"a, b\",2,1,2,0.5,0\n"), "{csv}");
+        let json: serde_json::Value = serde_json::from_str(&as_json(&tracks, &scene, [0.0; 3])).unwrap();
+        assert_eq!(json["tracks"][0]["points"][1][1], 0.5);
+        assert_eq!(json["tracks"][1]["layer"], "a, b");
+        assert!(json["tracks"][1]["points"][1].is_null() && json["times"][1] == 1.0);
+        // With an offset that f32 does not resolve.
+        assert!(as_csv(&tracks, &scene, [1e9, 0.0, 0.0]).contains("\n\"a, b\",2,1,1000000002,0.5,0\n"));
     }
 }

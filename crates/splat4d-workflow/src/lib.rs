@@ -35,7 +35,7 @@
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
 //! | `sound.rs` | sound of captures, runs and files: converted, cut |
 //! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
-//! | `device.rs`, `draw.rs`, `draw/`, `video.rs`, `raw_values.rs`, `rendering.rs`, `rendering/` | renders a scene's channels as images, films, arrays; shutter, lens, spheres, layers for compositing |
+//! | `channels.rs`, `device.rs`, `draw.rs`, `draw/`, `video.rs`, `raw_values.rs`, `rendering.rs`, `rendering/` | normals and numbers of Gaussians as image channels; renders a scene's channels as images, films, arrays; shutter, lens, spheres, layers for compositing |
 //! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
@@ -45,7 +45,8 @@
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `programs.rs`, `converting.rs`, `exporting.rs` | axes and units of other programs, their formats; .ply files, a page, tracks |
 //! | `meshing.rs`, `meshing/` | surfaces over time as triangle meshes |
-//! | `localising.rs` | pose and time of images |
+//! | `localising.rs`, `localising/` | pose and time of images |
+//! | `ground_truth.rs`, `ground_truth/` | errors against tracks of points in space that a capture states |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `adopting.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; a scene of another program as a run; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
@@ -71,6 +72,7 @@ pub mod aligning;
 pub mod baking;
 pub mod camera_file;
 pub mod capture_page;
+mod channels;
 pub mod chunked;
 pub mod comparing;
 pub mod comparison;
@@ -88,6 +90,7 @@ pub mod files;
 pub mod folding;
 pub mod following;
 pub mod foreign;
+pub mod ground_truth;
 pub mod growing;
 #[cfg(feature = "import")]
 pub mod importing;

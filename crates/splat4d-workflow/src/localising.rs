@@ -1,17 +1,19 @@
 //! The work behind `localise`: pose and time of images of a scene.
 
+mod search;
+
 use crate::camera_file;
 use crate::events::Listener;
 use crate::files;
 use crate::paths::View;
 use crate::run_folder::{view_json, views_in};
 use crate::source::{Source, not_empty};
+use search::{Located, Query, SURE};
 use serde_json::{Value, json};
 use splat4d::render::Antialias;
 use splat4d::scene::{Camera, Intrinsics, Planes};
 use splat4d::{Error, Result};
 use splat4d_train::capture::Rgb8;
-use splat4d_train::eval::localise::{self, Located, Query, SURE};
 use std::path::{Path, PathBuf};
 
 /// Largest difference of the shapes (width over height) of an image and a start's.
@@ -66,7 +68,7 @@ pub fn localise(
         let picture = read(path)?;
         let cameras = resized(&starts, &picture).map_err(|e| e.at(path.display()))?;
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        let located = localise::localise(&source.scene, &picture, &cameras, query, &mut |done, all| {
+        let located = search::localise(&source.scene, &picture, &cameras, query, &mut |done, all| {
             console.phase(&format!("localising {name}"), done, all);
         })?;
         console.clear();

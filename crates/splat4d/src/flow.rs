@@ -1,4 +1,4 @@
-//! Scene flow: velocities of Gaussians, rendered 3D velocity, and rendered 2D flow between two times and cameras.
+//! Scene flow: velocities of Gaussians as image channels, and rendered 2D flow between two times and cameras.
 //!
 //! A motion model already *is* scene flow; everything here is written once over [`Motion::at`] and
 //! [`Motion::velocity`](crate::motion::Motion::velocity) and rendered as further channels of the renderer, with the
@@ -57,14 +57,6 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
         first += own.rows();
     }
     out
-}
-
-/// The velocity of what each pixel shows, in scene units per second: [3, h, w] world axes.
-pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
-    let mut instant = Evaluation::default();
-    scene.at(shot.t, &mut instant);
-    let extra = velocity_columns(scene, &instant);
-    draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
 }
 
 /// [`velocities`] as further channels of an image: [splats, 4], x, y, z and 1 ([`divided`]).

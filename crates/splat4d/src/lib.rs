@@ -44,7 +44,7 @@
 //! | `gpu/resident/` | whole steps on tables that stay on the GPU: kernel parameters, ties of poses, camera colours, steps in flight and their repetition, films |
 //! | `device.rs`, `device/` | selects the rendering device and reports why; routes unsupported work to the CPU and falls back to it when the GPU fails; which layers a device keeps |
 //! | `flow.rs`, `flow/` | velocities, rendered velocity and 2D flow; tracks of Gaussians, queried points and their visibility, lifting of flow to 3D |
-//! | `channels.rs` | normals, labels, lifespans and uncertainty as rendered channels |
+//! | `channels.rs` | labels and features as rendered channels |
 //! | `format/` | readers and writers of bytes: `scene.safetensors`, .npy; in `mod.rs` the one list of dialects, each a file or folder with a line there; archives (`zip.rs`), fitted temporal opacity (`fade.rs`), formats that are only recognised (`foreign.rs`) |
 //! | `format/playback/` | `.s4d`: index, pages of quantised Gaussians, palette (docs/format.md) |
 //! | `format/ply/`, `format/spz/`, `format/sog/` | 3DGS, compressed and Spacetime .ply; .spz 2 to 4 with its axes; SOG, zipped or as files, streamed |

@@ -8,13 +8,10 @@ mod colour;
 mod conv;
 pub mod floaters;
 pub mod flow;
-pub mod localise;
 pub(crate) mod lpips;
 pub mod metrics;
-pub mod points;
 mod report;
 pub mod run;
-pub mod tracks;
 pub mod trajectory;
 
 pub use align::Align;

@@ -404,7 +404,7 @@ pub(crate) fn zoomed(stated: &Intrinsics, share: f64) -> Intrinsics {
 }
 
 /// A pose moved by a twist (ρ, θ) from the left.
-pub(crate) fn moved(pose: &Se3, twist: [f64; 6]) -> Se3 {
+pub fn moved(pose: &Se3, twist: [f64; 6]) -> Se3 {
     exp(twist).after(pose)
 }
 

@@ -47,6 +47,14 @@ fn renderer() -> Renderer<f64> {
     Renderer::new(RenderConfig::default())
 }
 
+/// The velocity of what each pixel shows, in scene units per second: [3, h, w] world axes.
+fn render_velocity(scene: &Scene<f64>, shot: Shot<'_>, renderer: &mut Renderer<f64>) -> Flow<f64> {
+    let mut instant = Evaluation::default();
+    scene.at(shot.t, &mut instant);
+    let extra = velocity_columns(scene, &instant);
+    draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
+}
+
 /// Calls `f(x, y, flow)` for every pixel that shows the wall.
 fn each_pixel(flow: &Flow<f64>, mut f: impl FnMut(usize, usize, [f64; 2])) {
     let mut count = 0;

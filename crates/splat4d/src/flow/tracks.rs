@@ -1,4 +1,4 @@
-//! Tracks: where chosen Gaussians are over time, for any motion model, as data and as JSON or CSV text.
+//! Tracks: where chosen Gaussians are over time, for any motion model.
 //!
 //! A track is as long as the lifespan of its Gaussian: models with short lifespans give short tracks, and times at
 //! which a Gaussian is not alive have no position.
@@ -6,7 +6,6 @@
 use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
 use crate::scene::{Rows, Space, Time};
-use std::fmt::Write;
 
 /// One Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -61,55 +60,6 @@ impl Tracks {
     pub fn track(&self, member: usize) -> &[Option<[f32; 3]>] {
         &self.points[member * self.times.len()..(member + 1) * self.times.len()]
     }
-
-    /// With `offset` added in f64. As JSON:
-    /// `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
-    pub fn to_json<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
-        let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", self.times);
-        for (i, m) in self.members.iter().enumerate() {
-            let name = serde_json::Value::from(scene.layers[m.layer].name.as_str());
-            let comma = if i > 0 { "," } else { "" };
-            let _ = write!(out, "{comma}\n{{\"layer\":{name},\"gaussian\":{},\"points\":[", m.row);
-            for (k, point) in self.track(i).iter().enumerate() {
-                let comma = if k > 0 { "," } else { "" };
-                let _ = match point {
-                    Some(p) => {
-                        let [x, y, z] = placed(*p, offset);
-                        write!(out, "{comma}[{x},{y},{z}]")
-                    }
-                    None => write!(out, "{comma}null"),
-                };
-            }
-            out.push_str("]}");
-        }
-        out.push_str("\n]}\n");
-        out
-    }
-
-    /// With `offset` added in f64. As CSV: a header `layer,gaussian,time,x,y,z` and a line for every time at which a
-    /// Gaussian is alive.
-    pub fn to_csv<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
-        let mut out = csv::Writer::from_writer(Vec::new());
-        out.write_record(["layer", "gaussian", "time", "x", "y", "z"]).expect("memory takes every row");
-        for (i, m) in self.members.iter().enumerate() {
-            let (name, row) = (&scene.layers[m.layer].name, m.row.to_string());
-            for (t, point) in self.times.iter().zip(self.track(i)) {
-                if let Some(p) = point {
-                    let [x, y, z] = placed(*p, offset);
-                    out.write_record([name, &row, &t.to_string(), &x, &y, &z]).expect("memory takes every row");
-                }
-            }
-        }
-        String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
-    }
-}
-
-/// A position with the offset added in f64, as text; the shortest of f32 where there is none.
-fn placed(p: [f32; 3], offset: [f64; 3]) -> [String; 3] {
-    std::array::from_fn(|k| match offset[k] == 0.0 {
-        true => p[k].to_string(),
-        false => (f64::from(p[k]) + offset[k]).to_string(),
-    })
 }
 
 /// Every n-th Gaussian of a scene. Panics: `every` is 0.
@@ -184,13 +134,6 @@ mod tests {
         assert_eq!(tracks.members.iter().map(|m| m.row).collect::<Vec<_>>(), [0, 2, 4]);
         assert_eq!(tracks.track(1), [Some([2.0, 0.0, 0.0]), Some([2.0, 0.5, 0.0])]);
         assert_eq!(tracks.track(2), [Some([4.0, 0.0, 0.0]), None], "it is dead by then");
-        let csv = tracks.to_csv(&s, [0.0; 3]);
-        assert_eq!(csv.lines().count(), 6, "{csv}");
-        assert!(csv.contains("\n\"a, b\",2,1,2,0.5,0\n"), "{csv}");
-        let json: serde_json::Value = serde_json::from_str(&tracks.to_json(&s, [0.0; 3])).unwrap();
-        assert_eq!(json["tracks"][1]["points"][1][1], 0.5);
-        assert_eq!(json["tracks"][2]["layer"], "a, b");
-        assert!(json["tracks"][2]["points"][1].is_null() && json["times"][1] == 1.0);
     }
 
     #[test]

@@ -7,13 +7,13 @@
 //! colour are free, since another camera has another exposure. What does not fit the scene much better than one plain
 //! colour would is refused ([`Located::sure`]).
 
-use crate::Result;
-use crate::train_state::moved;
+use splat4d::Result;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::cholesky::Cholesky;
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
+use splat4d_train::train_state::moved;
 
 /// Longer sides of images, small to large, and starts that are still followed in each.
 const LEVELS: [(usize, usize); 4] = [(48, 6), (96, 3), (192, 1), (384, 1)];
@@ -44,11 +44,11 @@ const FOCAL: usize = 7;
 /// Of a
 /// scene with 31 dB, held-out images reached 0.10, images of other scenes and mirror images 0.78 and more
 /// (docs/refine.md).
-pub const SURE: f64 = 1.0 / 3.0;
+pub(super) const SURE: f64 = 1.0 / 3.0;
 
 /// The query.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Query {
+pub(super) struct Query {
     /// Settings of the renderer.
     pub antialias: Antialias,
     /// Whether the focal length is searched for too.
@@ -57,7 +57,7 @@ pub struct Query {
 
 /// Estimated pose and time of an image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Located {
+pub(super) struct Located {
     /// From where, with the image's size.
     pub camera: Camera,
     /// When; the beginning of the clip where nothing moves.
@@ -102,7 +102,7 @@ struct Search<'a> {
 /// followed, and all.
 ///
 /// Errors: those of rendering. Panics: no starts; a start of another size than the image's.
-pub fn localise(
+pub(super) fn localise(
     scene: &Scene<f32>,
     picture: &Planes<f32>,
     starts: &[Camera],

@@ -6,15 +6,15 @@
 //! brings `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the rendered
 //! visibility is compared with it; else every point in the image counts.
 
-use crate::capture::Capture;
-use crate::eval::tracks::Truth;
-use crate::{Error, Result};
+use super::tracks::Truth;
 use splat4d::flow::query::{Place, Query, follow, sights};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
 use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
+use splat4d::{Error, Result};
+use splat4d_train::capture::Capture;
 
 /// True visibility of the points in each camera.
 pub const VISIBLE: &str = "truth/tracks_visible.npy";
@@ -155,7 +155,7 @@ fn visibility(capture: &Capture, truth: &Truth) -> Result<Option<Visible>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let bytes = crate::files::read(&path)?;
+    let bytes = splat4d_train::files::read(&path)?;
     let array = Npy::read(&bytes).map_err(|e| e.at(path.display()))?;
     let wanted = [capture.cameras.len(), truth.frames, truth.points];
     if array.shape != wanted {

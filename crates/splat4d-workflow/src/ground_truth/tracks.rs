@@ -6,14 +6,14 @@
 //! itself, its distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which
 //! none of a point's Gaussians is alive are not counted, but the share that is counted is reported.
 
-use crate::capture::Capture;
-use crate::{Error, Result};
 use splat4d::flow::tracks::{Tracks, nearest};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
 use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
+use splat4d::{Error, Result};
+use splat4d_train::capture::Capture;
 
 /// Path of the truth in a capture.
 pub const FILE: &str = "truth/tracks.npy";
@@ -73,7 +73,7 @@ impl Truth {
         if !path.is_file() {
             return Ok(None);
         }
-        let bytes = crate::files::read(&path)?;
+        let bytes = splat4d_train::files::read(&path)?;
         Self::read(&bytes).map(Some).map_err(|e| e.at(path.display()))
     }
 
