@@ -177,6 +177,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             tracks: None,
             recorded: None,
             shutter: None,
+            vignetting: None,
             mask: None,
         }
     };
