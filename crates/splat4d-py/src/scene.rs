@@ -258,8 +258,8 @@ impl Scene {
     /// Renders at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
     /// camera's z in scene units; or, as in `splat4d render --channel`, `flow` [h, w, 2] in pixels to the scene's next
     /// frame, `velocity` [h, w, 3] in scene units per second, unit `normal` [h, w, 3] in camera axes, number of the
-    /// `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds, `uncertainty` [h, w] in scene units
-    /// (of a run). float32, NaN where empty. `device`: `cpu`, `gpu` or `auto`, for colour, alpha and depth; the CPU
+    /// `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds, `uncertainty` [h, w] of depth in
+    /// scene units. float32, NaN where empty. `device`: `cpu`, `gpu` or `auto`, for colour, alpha and depth; the CPU
     /// renders the others.
     ///
     /// With `requires_grad`, renders colour, alpha and depth on the CPU and returns a `Rendering`, whose
@@ -305,7 +305,7 @@ impl Scene {
         if kind.is_field() {
             let drawn = py.detach(|| {
                 let painter = Painter::new(scene, background, smooth, false);
-                let mut painter = painter.of_channel(kind, &self.views, &mut |_, _| {})?;
+                let mut painter = painter.of_channel(kind)?;
                 painter.draw(&camera.0, t.0);
                 Ok::<Planes<f32>, splat4d::Error>(painter.raw())
             });

@@ -1,18 +1,15 @@
 //! Image channels that only renders of this crate have: normals, lifespans, uncertainty and other numbers of Gaussians,
-//! each as further channels of the renderer ([`Shot::extra`]) with a last column that is 1 where a splat has a value, so
+//! each as further channels of the renderer ([`Shot::extra`](splat4d::render::Shot::extra)) with a last column that is 1 where a splat has a value, so
 //! that [`divided`](splat4d::flow::divided) gives the mean over what a pixel shows. Labels and features are in
 //! [`splat4d::channels`].
 
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sym3;
-use splat4d::render::{Importance, RenderConfig, Shot};
 use splat4d::scene::splats::COV;
-use splat4d::scene::{Camera, Table, Time};
+use splat4d::scene::{Camera, Planes, Table};
 
 /// The least gap between the two smallest variances, as a share of the largest, at which the shortest axis is one.
 const LEAST_GAP: f64 = 1e-3;
-/// Standard deviation of a pixel's error that [`uncertainties`] takes for granted: images of 26 dB.
-const PIXEL_NOISE: f64 = 0.05;
 
 /// Unit normals, the shortest axes of the splats turned towards the camera, in camera axes (x right, y down, z
 /// forward): [splats, 4], x, y, z and 1; zeros where no axis is the shortest.
@@ -65,58 +62,39 @@ pub(crate) fn lifetimes(scene: &Scene<f32>) -> Vec<Vec<f32>> {
     scene.layers.iter().map(|l| l.spans().into_iter().map(length).collect()).collect()
 }
 
-/// An image that states where Gaussians are.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Witness<'a> {
-    /// From where.
-    pub camera: &'a Camera,
-    /// When.
-    pub t: Time,
-}
-
-/// The standard deviation of each Gaussian's position that its images leave open, scene units, by layer and row: √(tr
-/// (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
-/// ([`Sensitivity::fisher`](splat4d::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may
-/// be from where it is when no image shows it. Each witness represents `share` images. Other Gaussians are taken for
-/// known, so that it states too little where several could explain a pixel.
+/// The depth of every splat and its square: [splats, 3], both and 1. `radial`: the distance from the camera instead of z
+/// in camera axes, for images of more than a half-space. Depths are relative to their median, so that the squares of near
+/// ones keep their digits.
 ///
-/// Source: the Fisher blocks of PUP 3D-GS (Hanson et al. 2025), read as the precision of a Laplace approximation with a
-/// Gaussian prior as in Bayes' Rays (Goli et al. 2024).
-pub(crate) fn uncertainties(
-    scene: &Scene<f32>,
-    witnesses: &[Witness<'_>],
-    share: f64,
-    reach: f64,
-    progress: &mut dyn FnMut(usize, usize),
-) -> Vec<Vec<f32>> {
-    /// Places of xx, xy, xz, yy, yz, zz of the mean in the upper triangle of a 6x6 block.
-    const MEAN: [usize; 6] = [0, 1, 2, 6, 7, 11];
-    let mut sums: Vec<Vec<[f64; 6]>> = scene.layers.iter().map(|l| vec![[0.0; 6]; l.params.len()]).collect();
-    let (mut importance, mut instant) = (Importance::new(RenderConfig::default()), Evaluation::default());
-    let mut found = Vec::new();
-    for (i, witness) in witnesses.iter().enumerate() {
-        progress(i, witnesses.len());
-        scene.at(witness.t, &mut instant);
-        let splats = scene.splats(&instant);
-        importance.sensitivities(&Shot::new(&splats, witness.camera, scene.background), &mut found);
-        let mut rest = found.as_slice();
-        for (sums, tape) in sums.iter_mut().zip(instant.tapes()) {
-            let (own, later) = rest.split_at(tape.out().rows());
-            rest = later;
-            for (j, one) in own.iter().enumerate() {
-                let sum = &mut sums[tape.rows().id(j)];
-                (0..6).for_each(|k| sum[k] += one.fisher[MEAN[k]]);
-            }
+/// [`spread`] makes the uncertainty of an image of them.
+pub(crate) fn depth_columns(instant: &Evaluation<f32>, camera: &Camera, radial: bool) -> Table<f32> {
+    let mut depths = Vec::new();
+    for tape in instant.tapes() {
+        for j in 0..tape.out().rows() {
+            let [x, y, z] = camera.cam_from_world.apply(tape.out().read::<3>(j, 0).map(f64::from));
+            depths.push(if radial { (x * x + y * y + z * z).sqrt() } else { z });
         }
     }
-    progress(witnesses.len(), witnesses.len());
-    let precision = share / (PIXEL_NOISE * PIXEL_NOISE);
-    let deviation = |sum: &[f64; 6]| {
-        let (values, _) = sym3::eigen(sum.map(|x| precision * x));
-        let variance = |v: f64| 1.0 / (v.max(0.0) + 1.0 / (reach * reach));
-        (values.map(variance).iter().sum::<f64>() / 3.0).sqrt() as f32
-    };
-    sums.iter().map(|layer| layer.iter().map(deviation).collect()).collect()
+    let mut out = Table::new(&[("depth", 2), ("valid", 1)], depths.len());
+    if let Some(last) = depths.len().checked_sub(1) {
+        let mut order = depths.clone();
+        let middle = *order.select_nth_unstable_by(last / 2, f64::total_cmp).1;
+        for (j, depth) in depths.into_iter().enumerate() {
+            let depth = depth - middle;
+            out.write(j, 0, [depth, depth * depth, 1.0].map(|x| x as f32));
+        }
+    }
+    out
+}
+
+/// The standard deviation of the depths that each pixel shows, [1, h, w], from the [`divided`](splat4d::flow::divided)
+/// means of [`depth_columns`]. A surface is one depth; haze, and surfaces that share a pixel, are several.
+pub(crate) fn spread(means: &Planes<f32>) -> Planes<f32> {
+    let mut out = Planes::new(1, means.height, means.width);
+    for ((out, depth), square) in out.data.iter_mut().zip(means.plane(0)).zip(means.plane(1)) {
+        *out = (square - depth * depth).max(0.0).sqrt();
+    }
+    out
 }
 
 #[cfg(test)]
@@ -126,9 +104,9 @@ mod tests {
     use splat4d::layers::Layer;
     use splat4d::math::Se3;
     use splat4d::motion::{Spec, build};
-    use splat4d::render::{Image, Renderer};
+    use splat4d::render::{Image, RenderConfig, Renderer, Shot};
     use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
-    use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params};
+    use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, Time};
 
     fn camera() -> Camera {
         Camera::with_fov_y(Se3::look_at([0.0, 0.0, 4.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.7, 48, 32)
@@ -184,21 +162,48 @@ mod tests {
         assert!((long[0] - 1.0).abs() < 1e-5 && (0.1..0.5).contains(&short[0]), "{long:?} {short:?}");
     }
 
+    /// What the middle of an image shows of discs on the camera's axis, at these depths and with these opacities.
+    fn uncertainty(discs: &[(f32, f32)], radial: bool) -> f32 {
+        let camera = Camera::with_fov_y(Se3::look_at([0.0; 3], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]), 0.7, 33, 33);
+        let mut p = Params::new(discs.len(), 1, LifeKind::Infinite.columns());
+        for (r, &(z, opacity)) in discs.iter().enumerate() {
+            p[GEOMETRY].write(r, 0, [0.0, 0.0, z]);
+            p[GEOMETRY].write(r, QUAT, [1.0, 0.0, 0.0, 0.0]);
+            p[GEOMETRY].write(r, LOG_SCALE, [0.0, 0.0, -5.0]);
+            p[GEOMETRY].set(r, OPACITY, (opacity / (1.0 - opacity)).ln());
+        }
+        let motion = build(&Spec::Still, &mut p).unwrap();
+        let scene = Scene { layers: vec![Layer::new("a", p, motion, LifeKind::Infinite)], ..Scene::default() };
+        let (mut instant, mut image) = (Evaluation::default(), Image::default());
+        scene.at(Time(0.0), &mut instant);
+        let columns = depth_columns(&instant, &camera, radial);
+        let splats = scene.splats(&instant);
+        let shot = Shot { extra: Some(&columns), ..Shot::new(&splats, &camera, [0.0; 3]) };
+        Renderer::new(RenderConfig::default()).render(&shot, &mut image);
+        spread(&divided(&image.extra).0).get(0, 16, 16)
+    }
+
     #[test]
-    fn uncertainty_rises_with_fewer_images() {
-        let scene = scene();
-        let (front, side) =
-            (camera(), Camera { cam_from_world: Se3::look_at([4.0, 0.0, 0.0], [0.0; 3], [0.0, 1.0, 0.0]), ..camera() });
-        let of = |views: &[(&Camera, f64)]| {
-            let witnesses: Vec<Witness<'_>> = views.iter().map(|&(camera, t)| Witness { camera, t: Time(t) }).collect();
-            uncertainties(&scene, &witnesses, 1.0, 10.0, &mut |_, _| {}).remove(0)
+    fn uncertainty_is_the_spread_of_depths_in_a_pixel() {
+        let expected = |discs: &[(f32, f32)]| {
+            let (mut light, mut sums) = (1.0, [0.0; 3]);
+            for (depth, opacity) in discs {
+                let terms = [1.0, *depth, depth * depth].map(|x| light * opacity * x);
+                sums.iter_mut().zip(terms).for_each(|(sum, x)| *sum += x);
+                light *= 1.0 - opacity;
+            }
+            (sums[2] / sums[0] - (sums[1] / sums[0]).powi(2)).max(0.0).sqrt()
         };
-        let (none, one, both) = (of(&[]), of(&[(&front, 0.5)]), of(&[(&front, 0.5), (&side, 0.5)]));
-        assert!((none[0] - 10.0).abs() < 1e-4 && (none[1] - 10.0).abs() < 1e-4);
-        // One image states little of the depth, a second from the side states it.
-        assert!(one[0] < none[0] && one[0] > 2.0 * both[0], "{one:?} {both:?}");
-        // An image of another time adds no information about short-lived Gaussians.
-        let late = of(&[(&front, 0.5), (&side, 0.0)]);
-        assert!(late[0] < 0.5 * one[0] && (late[1] / one[1] - 1.0).abs() < 1e-4, "{late:?}");
+        for radial in [false, true] {
+            assert!(uncertainty(&[(4.0, 0.9)], radial) < 1e-3, "a surface is one depth");
+            for discs in [&[(4.0, 0.5), (6.0, 0.9)][..], &[(4.0, 0.9), (6.0, 0.5), (50.0, 0.5)]] {
+                let (found, expected) = (uncertainty(discs, radial), expected(discs));
+                assert!((found / expected - 1.0).abs() < 1e-3, "{found}, not {expected}");
+            }
+            // A Gaussian that is far away, and not rendered here, takes no digits from near depths.
+            let near = expected(&[(4.0, 0.6), (4.02, 0.9)]);
+            let found = uncertainty(&[(4.0, 0.6), (4.02, 0.9), (1000.0, 0.001)], radial);
+            assert!((found / near - 1.0).abs() < 0.02, "{found}, not {near}");
+        }
     }
 }

@@ -5,10 +5,8 @@ mod layers;
 mod panorama;
 mod transfer;
 
-use crate::channels::{self, Witness};
+use crate::channels;
 use crate::events::Listener;
-use crate::paths::View;
-use crate::source::cloud;
 use rayon::prelude::*;
 use splat4d::channels::{feature_columns, label_columns};
 use splat4d::device;
@@ -47,7 +45,7 @@ pub enum Channel {
     Feature,
     /// Seconds of the clip in which the visible surface exists: long is bright
     Life,
-    /// Standard deviation of positions that the training images leave open: uncertain is bright
+    /// Standard deviation of the depths that a pixel shows: uncertain is bright
     Uncertainty,
 }
 
@@ -94,9 +92,7 @@ impl Channel {
             Self::Label => "The most probable label, one colour per label",
             Self::Feature => "Feature channels: the first three as red, green, blue around grey",
             Self::Life => "Seconds of the clip in which the visible surface exists: long is bright",
-            Self::Uncertainty => {
-                "Standard deviation of positions that the training images leave open: uncertain is bright"
-            }
+            Self::Uncertainty => "Standard deviation of the depths that a pixel shows: uncertain is bright",
         }
     }
 
@@ -129,6 +125,8 @@ impl Channel {
 
 /// Alpha below which a pixel has no depth, and no other value to show.
 const DEPTH_ALPHA: f32 = 0.1;
+/// Smallest uncertainty with a colour of its own, as a share of the largest.
+const LEAST_UNCERTAINTY: f32 = 1e-3;
 /// Colours from little to much, sRGB: dark blue to pale yellow, brightness rising throughout.
 const RAMP: [[f32; 3]; 6] = [
     [13.0, 10.0, 36.0],
@@ -141,8 +139,6 @@ const RAMP: [[f32; 3]; 6] = [
 /// Turn of the hue from one label to the next, of a whole one: the golden section, so that few labels are far apart and
 /// many never meet.
 const GOLDEN: f32 = 0.618_034;
-/// Most training images used for the uncertainty of a scene, evenly chosen.
-const WITNESSES: usize = 48;
 
 /// Pixels that a thread turns into bytes at once: enough to amortise the overhead.
 const CHUNK: usize = 1 << 14;
@@ -244,15 +240,8 @@ impl<'a> Painter<'a> {
         Time(if spans { time.max(scene.clip[0]).min(scene.clip[1]) } else { time })
     }
 
-    /// The same for images of this channel. `views`: the training images' cameras, from which uncertainty is computed.
-    ///
-    /// Errors: a scene without labels, or without training images to be certain by.
-    pub fn of_channel(
-        mut self,
-        channel: Channel,
-        views: &[View],
-        progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Self> {
+    /// The same for images of this channel. Errors: a scene without the labels or features that are requested.
+    pub fn of_channel(mut self, channel: Channel) -> Result<Self> {
         self.channel = channel;
         self.depth |= channel == Channel::Depth;
         self.abilities.extra = channel.is_field();
@@ -266,19 +255,6 @@ impl<'a> Painter<'a> {
                     .remedy("Give the capture's cameras feature images, then: splat4d label RUN (docs/labels.md)."));
             }
             Channel::Life => self.numbers = channels::lifetimes(self.scene),
-            Channel::Uncertainty => {
-                let seen: Vec<&View> = views.iter().filter(|v| !v.held).collect();
-                if seen.is_empty() {
-                    return Err(Error::input("the training cameras are unknown")
-                        .remedy("Render uncertainty of a run: a scene file alone has no training cameras."));
-                }
-                let chosen: Vec<&View> = seen.iter().copied().step_by(seen.len().div_ceil(WITNESSES)).collect();
-                let witnesses: Vec<Witness<'_>> =
-                    chosen.iter().map(|v| Witness { camera: &v.camera, t: Time(v.time) }).collect();
-                let share = seen.len() as f64 / chosen.len() as f64;
-                let reach = cloud(self.scene).1;
-                self.numbers = channels::uncertainties(self.scene, &witnesses, share, reach, progress);
-            }
             _ => {}
         }
         Ok(self)
@@ -330,12 +306,16 @@ impl<'a> Painter<'a> {
             Channel::Normal => channels::normal_columns(&self.instant, camera),
             Channel::Label => label_columns(scene, &self.instant).expect("a scene with labels was requested"),
             Channel::Feature => feature_columns(scene, &self.instant).expect("a scene with features was requested"),
+            Channel::Uncertainty => channels::depth_columns(&self.instant, camera, self.panorama.is_some()),
             _ => channels::number_columns(&self.instant, &self.numbers),
         };
         let splats = scene.splats(&self.instant);
         let shot = Shot { extra: Some(&columns), ..Shot::new(&splats, camera, self.background) };
         shoot(&mut self.backend, self.listener, &mut self.panorama, &shot, &mut self.image);
         self.field = flow::divided(&self.image.extra);
+        if self.channel == Channel::Uncertainty {
+            self.field.0 = channels::spread(&self.field.0);
+        }
     }
 
     /// The numbers of the last image, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
@@ -439,8 +419,12 @@ impl<'a> Painter<'a> {
         numbers.sort_by(f32::total_cmp);
         let n = numbers.len();
         let [low, high] = [numbers[n / 100], numbers[n - 1 - n / 100]];
-        let signed = matches!(self.channel, Channel::Flow | Channel::Velocity);
-        Some([if signed { 0.0 } else { low }, high])
+        Some(match self.channel {
+            Channel::Flow | Channel::Velocity => [0.0, high],
+            // A pixel with one Gaussian has none, which no logarithm shows.
+            Channel::Uncertainty => [low.max(LEAST_UNCERTAINTY * high), high],
+            _ => [low, high],
+        })
     }
 }
 

@@ -126,7 +126,7 @@ pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Lis
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.or(background).unwrap_or(source.scene.background);
     let painter = Painter::new(&source.scene, background, source.antialias(), depth);
-    let mut painter = channel(painter, args, &source, console)?;
+    let mut painter = channel(painter, args, console)?;
     painter = painter.around(args.photo.panorama(size));
     let shot = paths::Shot { camera, time: args.freeze.unwrap_or(source.scene.clip[0]) };
     painter.draw(&shot.camera, shot.time);
@@ -200,19 +200,9 @@ fn stem(prefix: &Path) -> OsString {
 }
 
 /// A painter of the channel that is requested, on the device that is.
-fn channel<'a>(
-    painter: Painter<'a>,
-    args: &RenderOptions,
-    source: &Source,
-    console: &'a dyn Listener,
-) -> Result<Painter<'a>> {
-    let views = if args.channel == Channel::Uncertainty { source.views()? } else { Vec::new() };
-    let mut phase = |done, of| console.phase("evaluating the training images", done, of);
-    let painter = painter
-        .of_channel(args.channel, &views, &mut phase)?
-        .on(|config, wanted| device::open(args.device, config, wanted, console).backend, console);
-    console.clear();
-    Ok(painter)
+fn channel<'a>(painter: Painter<'a>, args: &RenderOptions, console: &'a dyn Listener) -> Result<Painter<'a>> {
+    let painter = painter.of_channel(args.channel)?;
+    Ok(painter.on(|config, wanted| device::open(args.device, config, wanted, console).backend, console))
 }
 
 /// Many images along a path.
@@ -288,7 +278,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     }
     let background = args.background.unwrap_or(scene.background);
     let depth = args.channel == Channel::Depth;
-    let painter = channel(Painter::new(scene, background, source.antialias(), depth), args, &source, console)?;
+    let painter = channel(Painter::new(scene, background, source.antialias(), depth), args, console)?;
     let mut painter = painter.around(args.photo.panorama(size));
     let plain = matches!(args.channel, Channel::Color | Channel::Alpha | Channel::Normal | Channel::Label);
     let range = if plain { NO_RANGE } else { range(&mut painter, &shots) };

@@ -140,7 +140,7 @@ fn exr_files_hold_linear_colour_depth_and_motion() {
     let names: Vec<&str> = linear.iter().map(|(name, _)| name.as_str()).collect();
     assert_eq!(names, ["A", "B", "G", "R", "Z", "forward.u", "forward.v"]);
     let plane = |planes: &[(String, Vec<f32>)], name: &str| planes.iter().find(|p| p.0 == name).unwrap().1.clone();
-    let mut painter = painter(&source).of_channel(Channel::Depth, &[], &mut |_, _| ()).unwrap();
+    let mut painter = painter(&source).of_channel(Channel::Depth).unwrap();
     painter.draw(&all[12].camera, all[12].time);
     let (depth, alpha) = (painter.raw(), painter.image.alpha.clone());
     let (a, r, s, z) = (plane(&linear, "A"), plane(&linear, "R"), plane(&srgb, "R"), plane(&linear, "Z"));
@@ -154,7 +154,7 @@ fn exr_files_hold_linear_colour_depth_and_motion() {
             assert!((light - curve).abs() < 1e-4, "{light} {curve}");
         }
     }
-    let mut flow = self::painter(&source).of_channel(Channel::Flow, &[], &mut |_, _| ()).unwrap();
+    let mut flow = self::painter(&source).of_channel(Channel::Flow).unwrap();
     flow.draw(&all[12].camera, all[12].time);
     let (raw, u, v) = (flow.raw(), plane(&linear, "forward.u"), plane(&linear, "forward.v"));
     let mut moved = 0;
