@@ -7,7 +7,7 @@ use super::{code, files, is_test, is_word, read, report};
 /// are 600 for `splat4d` and 250 for `splat4d-train`. Raised once, when captures that are still filmed and networks' poses
 /// came: the command and Python call them.
 const PUBLIC: [(&str, usize); 3] =
-    [("crates/splat4d/src", 850), ("crates/splat4d-train/src", 475), ("crates/splat4d-import/src", 98)];
+    [("crates/splat4d/src", 846), ("crates/splat4d-train/src", 475), ("crates/splat4d-import/src", 98)];
 /// A count this far below its limit is a limit to be lowered.
 const SLACK: usize = 10;
 

@@ -139,7 +139,7 @@ fn pack(m: &Moving, outside: &mut [bool; 2]) -> [u8; ROW] {
 /// Reads a moving scene. Without our own key, one second is assumed for the clip.
 ///
 /// Errors: another magic number; JSON that does not state where the Gaussians are; truncated.
-pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
+pub(crate) fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     let mut warnings = Warnings::default();
     let mut c = Cursor::new(bytes, ".splatv file");
     if c.take(4)? != MAGIC {

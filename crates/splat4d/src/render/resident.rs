@@ -43,7 +43,8 @@ pub enum Moves {
 
 impl Moves {
     /// Blocks of spherical harmonics in the layer's SH table.
-    pub fn blocks(&self) -> usize {
+    #[cfg(feature = "gpu")]
+    pub(crate) fn blocks(&self) -> usize {
         if let Self::Sliced { harmonics, .. } = self { harmonics + 1 } else { 1 }
     }
 }

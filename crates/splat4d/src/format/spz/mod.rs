@@ -31,9 +31,7 @@ pub(crate) const DIALECT: Dialect = Dialect {
     up: Y_DOWN,
     moves: false,
     mark: Some(|bytes| bytes.starts_with(&GZIP_MAGIC) || bytes.starts_with(&MAGIC)),
-    read: |bytes| {
-        read(bytes).map(|(params, info, warnings)| Opened { up: Some(info.up), ..Opened::from((params, warnings)) })
-    },
+    read: |bytes| read(bytes).map(|(params, up, warnings)| Opened { up: Some(up), ..Opened::from((params, warnings)) }),
     writer: Writer::Moment(|params, options, mut out| write(params, options.spz_version, options.up, &mut out)),
     world: false,
     fixed_axes: false,
@@ -53,21 +51,6 @@ pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1F, 0x8B];
 const ANTIALIASED: u8 = 1;
 /// Flag: vendors' extensions are present.
 const EXTENDED: u8 = 2;
-
-/// Metadata of a file, in addition to its Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SpzInfo {
-    /// 2, 3 or 4.
-    pub version: u32,
-    /// Degree of the spherical harmonics in the file, 0-4; degree 4 is left out on reading.
-    pub sh_degree: usize,
-    /// Whether it was trained with the anti-aliasing filter (our `antialias`).
-    pub antialiased: bool,
-    /// Bits behind the point of a coordinate.
-    pub fraction_bits: u8,
-    /// Which way is up: as the file states, else as in .ply.
-    pub up: [f64; 3],
-}
 
 /// The header's numbers, the same in all versions.
 #[derive(Clone, Copy, Debug)]
@@ -104,8 +87,9 @@ impl Header {
     }
 }
 
-/// Reads a file of version 2 to 4. Errors: not .spz, another version, truncated, streams of the wrong length.
-pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
+/// Reads a file of version 2 to 4: Gaussians and which way is up, as the file states, else as in .ply. Spherical harmonics
+/// of degree 4 are left out. Errors: not .spz, another version, truncated, streams of the wrong length.
+pub(crate) fn read(bytes: &[u8]) -> Result<(Params, [f64; 3], Warnings)> {
     let mut warnings = Warnings::default();
     let container::Opened { header, streams, axes } = container::open(bytes, &mut warnings)?;
     let mut params = streams::unpack(&header, &streams)?;
@@ -113,18 +97,10 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     if header.degree > crate::math::sh::MAX_DEGREE {
         warnings.add("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
     }
-    let antialiased = header.flags & ANTIALIASED != 0;
-    if antialiased {
+    if header.flags & ANTIALIASED != 0 {
         warnings.add("the file was trained with an anti-aliasing filter: render it with one");
     }
-    let info = SpzInfo {
-        version: header.version,
-        sh_degree: header.degree,
-        antialiased,
-        fraction_bits: header.fraction_bits,
-        up,
-    };
-    Ok((params, info, warnings))
+    Ok((params, up, warnings))
 }
 
 /// Writes a file of the given version that names its axes, where `up` is along one. Returns what was clipped or left
