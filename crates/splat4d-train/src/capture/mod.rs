@@ -78,7 +78,6 @@ pub use sequence::Timing;
 pub use shutter::Shutter;
 pub use store::{ImageStore, Picture, StoredPicture};
 pub use tracks::Tracks;
-pub use vignetting::Vignetting;
 
 use account::Account;
 use splat4d::Result;
@@ -178,8 +177,8 @@ pub struct Frame {
     pub recorded: Option<Arc<Vec<u8>>>,
     /// Its rolling shutter and exposure; `None`: all rows are of its time.
     pub shutter: Option<Shutter>,
-    /// Vignetting that is removed from its image.
-    pub vignetting: Option<Vignetting>,
+    /// Coefficients of the vignetting that is removed from its image; `None`: there is none.
+    pub vignetting: Option<[f64; 3]>,
 }
 
 /// One camera of the rig, or one moving camera.
@@ -358,7 +357,7 @@ struct RawFrame {
     tracks: Option<Arc<Tracks>>,
     /// Readout and exposure, seconds, as stated.
     shutter: [Option<f64>; 2],
-    vignetting: Option<Vignetting>,
+    vignetting: Option<[f64; 3]>,
     split: Split,
 }
 

@@ -7,8 +7,8 @@ use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_cloud;
 use super::{
-    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, Geometry, HoldOut, RawCapture, RawFrame, Tracks,
-    Vignetting, pose, shutter,
+    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, Geometry, HoldOut, RawCapture, RawFrame, Tracks, pose,
+    shutter, vignetting,
 };
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -497,14 +497,14 @@ fn read_shutter(node: &Node<'_>, key: &str) -> Result<Option<f64>> {
 }
 
 /// A camera's vignetting: up to three coefficients.
-fn read_vignetting(node: &Node<'_>) -> Result<Option<Vignetting>> {
+fn read_vignetting(node: &Node<'_>) -> Result<Option<[f64; 3]>> {
     let values = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
     let mut k = [0.0; 3];
     if values.len() > k.len() {
         return Err(node.error(format!("there are {} coefficients, more than 3", values.len())));
     }
     k[..values.len()].copy_from_slice(&values);
-    Vignetting::new(k).map_err(|e| node.at(e))
+    vignetting::checked(k).map_err(|e| node.at(e))
 }
 
 fn read_lens(node: &Node<'_>) -> Result<Lens> {

@@ -8,7 +8,7 @@
 use super::geometry::DepthMap;
 use super::lens::Distortion;
 use super::picture::{self, Raster, Samples};
-use super::{Capture, DepthKind, Frame, Split, depth, flow, panorama};
+use super::{Capture, DepthKind, Frame, Split, depth, flow, panorama, vignetting};
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::math::image::box_means;
@@ -411,8 +411,8 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let (stored_width, stored_height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
     drop(raster);
-    if let Some(vignetting) = frame.vignetting {
-        vignetting.remove(&mut planes, stored_width, stored_height);
+    if let Some(k) = &frame.vignetting {
+        vignetting::remove(k, &mut planes, stored_width, stored_height);
     }
     planes.extend(mask);
     let mut valid: Option<Vec<f32>> = frame.recorded.as_ref().map(|r| r.iter().map(|&v| f32::from(v)).collect());

@@ -14,40 +14,33 @@ const LIGHT: [f64; 2] = [0.1, 2.0];
 /// Radii at which coefficients are checked.
 const CHECKED: usize = 64;
 
-/// A lens's vignetting.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Vignetting([f64; 3]);
-
-impl Vignetting {
-    /// Of these coefficients; `None`: there is none. Errors: a corner that is nearly black, or far brighter than the middle.
-    pub(super) fn new(k: [f64; 3]) -> Result<Option<Self>> {
-        let own = Self(k);
-        let radii = (0..=CHECKED).map(|n| (n as f64 / CHECKED as f64).powi(2));
-        if let Some(light) = radii.map(|r2| own.light(r2)).find(|light| !(LIGHT[0]..=LIGHT[1]).contains(light)) {
-            let what = format!("invalid vignetting {k:?}: somewhere light would be {light:.2} of that in the middle");
-            return Err(Error::input(what).remedy(
-                "Give k1, k2, k3 of light = 1 + k1 r² + k2 r⁴ + k3 r⁶, r = 1 in the corners (lensfun's model \"pa\")",
-            ));
-        }
-        Ok((k != [0.0; 3]).then_some(own))
+/// Coefficients as a file states them; `None`: there is no vignetting. Errors: a corner that is nearly black, or far brighter
+/// than the middle.
+pub(super) fn checked(k: [f64; 3]) -> Result<Option<[f64; 3]>> {
+    let radii = (0..=CHECKED).map(|n| (n as f64 / CHECKED as f64).powi(2));
+    if let Some(light) = radii.map(|r2| light(&k, r2)).find(|light| !(LIGHT[0]..=LIGHT[1]).contains(light)) {
+        let what = format!("invalid vignetting {k:?}: somewhere light would be {light:.2} of that in the middle");
+        return Err(Error::input(what).remedy(
+            "Give k1, k2, k3 of light = 1 + k1 r² + k2 r⁴ + k3 r⁶, r = 1 in the corners (lensfun's model \"pa\")",
+        ));
     }
+    Ok((k != [0.0; 3]).then_some(k))
+}
 
-    /// Light at a squared radius, 1 in the middle.
-    fn light(&self, r2: f64) -> f64 {
-        let [k1, k2, k3] = self.0;
-        1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    }
+/// Light at a squared radius, 1 in the middle.
+fn light([k1, k2, k3]: &[f64; 3], r2: f64) -> f64 {
+    1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+}
 
-    /// Removes it from planes of codes [height, width] of the whole image.
-    pub(super) fn remove(&self, planes: &mut [Vec<f32>], width: usize, height: usize) {
-        let (w, h) = (width as f64, height as f64);
-        let gain = |p: usize| {
-            let (x, y) = ((p % width) as f64 + 0.5 - 0.5 * w, (p / width) as f64 + 0.5 - 0.5 * h);
-            self.light(4.0 * (x * x + y * y) / (w * w + h * h)).powf(-1.0 / GAMMA) as f32
-        };
-        let gains: Vec<f32> = (0..width * height).map(gain).collect();
-        planes.iter_mut().for_each(|plane| plane.iter_mut().zip(&gains).for_each(|(v, gain)| *v *= gain));
-    }
+/// Removes vignetting from planes of codes [height, width] of the whole image.
+pub(super) fn remove(k: &[f64; 3], planes: &mut [Vec<f32>], width: usize, height: usize) {
+    let (w, h) = (width as f64, height as f64);
+    let gain = |p: usize| {
+        let (x, y) = ((p % width) as f64 + 0.5 - 0.5 * w, (p / width) as f64 + 0.5 - 0.5 * h);
+        light(k, 4.0 * (x * x + y * y) / (w * w + h * h)).powf(-1.0 / GAMMA) as f32
+    };
+    let gains: Vec<f32> = (0..width * height).map(gain).collect();
+    planes.iter_mut().for_each(|plane| plane.iter_mut().zip(&gains).for_each(|(v, gain)| *v *= gain));
 }
 
 /// What is removed, for the user.
@@ -63,7 +56,7 @@ mod tests {
 
     #[test]
     fn what_a_lens_darkened_is_as_before() {
-        let lens = Vignetting::new([-0.5, 0.2, -0.1]).unwrap().unwrap();
+        let lens = checked([-0.5, 0.2, -0.1]).unwrap().unwrap();
         let (width, height) = (40, 30);
         let code = |p: usize| 0.2 + 0.6 * (p % 7) as f64 / 7.0;
         let darkened = |p: usize| {
@@ -75,7 +68,7 @@ mod tests {
         };
         let mut planes = vec![(0..width * height).map(darkened).collect::<Vec<f32>>(); 3];
         assert!(planes[0][0] < 0.9 * code(0) as f32);
-        lens.remove(&mut planes, width, height);
+        remove(&lens, &mut planes, width, height);
         for plane in &planes {
             assert!(plane.iter().enumerate().all(|(p, v)| (f64::from(*v) - code(p)).abs() < 1e-6));
         }
@@ -83,9 +76,9 @@ mod tests {
 
     #[test]
     fn impossible_coefficients_are_refused() {
-        assert_eq!(Vignetting::new([0.0; 3]).unwrap(), None);
+        assert_eq!(checked([0.0; 3]).unwrap(), None);
         for k in [[-0.95, 0.0, 0.0], [3.0, 0.0, 0.0], [f64::NAN, 0.0, 0.0], [-2.0, 2.0, 0.0]] {
-            assert!(Vignetting::new(k).unwrap_err().to_string().contains("invalid vignetting"), "{k:?}");
+            assert!(checked(k).unwrap_err().to_string().contains("invalid vignetting"), "{k:?}");
         }
     }
 }
