@@ -258,7 +258,7 @@ fn a_capture_is_trained_evaluated_and_exported() {
     last(&["info", str(&run)], "view", &run);
     last(&["eval", str(&run), "--split", "train"], "view", &run);
     last(&["convert", str(&run), str(&file), "--time", "0"], "view", &file);
-    last(&["edit", str(&run), "--delete", "size(9, 99)", "-o", str(&edited)], "view", &edited);
+    last(&["edit", str(&run), "--crop", "all", "-o", str(&edited)], "view", &edited);
 
     // render
     let frames = work.path().join("frames");

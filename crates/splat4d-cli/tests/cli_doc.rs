@@ -16,12 +16,12 @@ const PAGES: [Page; 4] = [
         file: "cli.md",
         head: "# Command line: captures and training\n\nEvery option, as `splat4d COMMAND --help` prints it. Tasks and \
                examples of all commands: [commands](verbs.md).\n\n| page | commands |\n|---|---|\n\
-               | this page | import, info, train, join |\n\
+               | this page | import, info, train |\n\
                | [results](cli-results.md) | status, eval, compare, render, predict, localise |\n\
-               | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
+               | [scenes and files](cli-scenes.md) | join, bake, compress, view, export |\n\
                | [conversion and edits](cli-edits.md) | convert, edit, label, priors, recipe, completions |\n\n\
                Every command also accepts these options:\n",
-        commands: &["import", "info", "train", "join"],
+        commands: &["import", "info", "train"],
     },
     Page {
         file: "cli-results.md",
@@ -31,9 +31,9 @@ const PAGES: [Page; 4] = [
     },
     Page {
         file: "cli-scenes.md",
-        head: "# Command line: scenes and files\n\nOptions of `bake`, `compress`, `view` and `export`. Options that every \
+        head: "# Command line: scenes and files\n\nOptions of `join`, `bake`, `compress`, `view` and `export`. Options that every \
                command accepts: [captures and training](cli.md).\n",
-        commands: &["bake", "compress", "view", "export"],
+        commands: &["join", "bake", "compress", "view", "export"],
     },
     Page {
         file: "cli-edits.md",
