@@ -197,7 +197,7 @@ pub(super) fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Res
     Ok((out, factor))
 }
 
-pub(super) fn color_at(picture: &Planes<f32>, [u, v]: [f64; 2]) -> [u8; 3] {
+fn color_at(picture: &Planes<f32>, [u, v]: [f64; 2]) -> [u8; 3] {
     let x = (u.max(0.0) as usize).min(picture.width - 1);
     let y = (v.max(0.0) as usize).min(picture.height - 1);
     [0, 1, 2].map(|c| (picture.get(c, y, x) * 255.0).round().clamp(0.0, 255.0) as u8)
