@@ -3,6 +3,9 @@
 //!
 //! All groups of frames are optimised at once, each from its own observed start, so that errors of one group do not
 //! enter the next. Memory of a network (`warm_up`) is filled with the current estimate of earlier actions.
+//!
+//! An action u (scaled to a size of 1) minimises 3/2 ℓ(u)/ℓ₀ + |u|²/2: ℓ is the loss of its frames, ℓ₀ that of as many
+//! frames with known actions. A model that errs more, or that does not react to an action, leaves it near zero.
 
 #[cfg(test)]
 mod tests;
@@ -20,6 +23,11 @@ const RATE: f64 = 0.2;
 /// Adam's decays, as in training (CONVENTIONS.md), and its guard against division by zero.
 const DECAYS: [f64; 2] = [0.8, 0.99];
 const EPSILON: f64 = 1e-15;
+
+/// Weight of the loss over that of known actions: three coordinates of one body, each with half its squared error.
+const EVIDENCE: f64 = 1.5;
+/// Known windows by which the loss is scaled.
+const KNOWN_WINDOWS: usize = 24;
 
 /// `known`, continued to the last but one tick of `paths` by the actions with which the network follows the paths best;
 /// each is constant over `hold` frames.
@@ -48,23 +56,38 @@ pub(crate) fn infer<N: Network>(model: &Learnt<N>, paths: &Paths, known: &Action
         let starts: Vec<usize> = groups.clone().map(|g| first + g * hold).collect();
         (groups, starts, horizon)
     });
+    let given = |tick: usize| model.action(Some(known), tick);
+    let weights = batches.each_ref().map(|(_, starts, horizon)| {
+        // Windows within the known frames, evenly.
+        let last = first.saturating_sub(*horizon).max(need);
+        let every = ((last - need) / KNOWN_WINDOWS).max(1);
+        let windows: Vec<usize> = (need..=last).step_by(every).filter(|s| s + horizon <= first).collect();
+        if windows.is_empty() || starts.is_empty() {
+            return EVIDENCE;
+        }
+        let window = model.window(paths, &windows, *horizon, given);
+        let usual = f64::from(rollout_loss(&model.net, &model.params, &window, None).0);
+        // The loss is a mean over the windows.
+        EVIDENCE * starts.len() as f64 / usual.max(f64::MIN_POSITIVE)
+    });
     let mut moments = vec![[0.0; 2]; width * free.len()];
     let mut unused = Grads::new(&model.params);
     for step in 0..STEPS {
-        let mut slopes = vec![vec![0.0; width]; free.len()];
+        // The gradient of |u|²/2 is u.
+        let mut slopes = free.clone();
         let action = |tick: usize| -> Action<f32> {
             match tick.checked_sub(first) {
                 Some(later) => free[later / hold].iter().map(|x| *x as f32).collect(),
-                None => model.action(Some(known), tick),
+                None => given(tick),
             }
         };
-        for (groups, starts, horizon) in batches.iter().filter(|b| !b.1.is_empty()) {
+        for ((groups, starts, horizon), weight) in batches.iter().zip(weights).filter(|(b, _)| !b.1.is_empty()) {
             let window = model.window(paths, starts, *horizon, action);
             unused.clear(&model.params);
             let (_, _, d_actions) = rollout_loss(&model.net, &model.params, &window, Some(&mut unused));
             for d_actions in &d_actions {
                 for (slope, d) in slopes[groups.clone()].iter_mut().zip(d_actions) {
-                    slope.iter_mut().zip(d).for_each(|(s, d)| *s += f64::from(*d));
+                    slope.iter_mut().zip(d).for_each(|(s, d)| *s += weight * f64::from(*d));
                 }
             }
         }

@@ -12,8 +12,7 @@ pub const FPS: f64 = 30.0;
 /// Frames of a world.
 pub const FRAMES: usize = 150;
 /// Names of all worlds.
-pub const NAMES: [&str; 8] =
-    ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth", "driven-pendulum"];
+pub const NAMES: [&str; 8] = ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth", "wind"];
 /// Scene units per second squared.
 const GRAVITY: f64 = 9.81;
 /// Steps of integration a frame.
@@ -65,8 +64,8 @@ impl World {
         let (bodies, poses) = match name {
             "pendulum" => pendulum(),
             "circle" => circle(),
-            "pushed-block" | "driven-pendulum" => {
-                let (bodies, poses, actions) = if name == "pushed-block" { pushed_block() } else { driven_pendulum() };
+            "pushed-block" | "wind" => {
+                let (bodies, poses, actions) = if name == "wind" { wind() } else { pushed_block() };
                 return Ok(Self { name: name.into(), bodies, poses, cloth: Vec::new(), actions: Some(actions) });
             }
             "bounce" => bounce(),
@@ -116,30 +115,19 @@ fn cuboid(sides: [f64; 3]) -> Body {
     Body { shape: Shape::Box(sides), points: (0..8).map(corner).collect() }
 }
 
-/// A rod of a pendulum, its pivot, and g/ℓ, 1/s²: 45 frames a swing.
-const PIVOT: [f64; 3] = [0.0, 2.35, 0.3];
-const LENGTH: f64 = 1.6;
-const RATE: f64 = 20.0;
-
-/// Rod and bob at an angle.
-fn hanging(angle: f64) -> Vec<Pose> {
-    let down = [angle.sin(), -angle.cos(), 0.0];
-    let r = turned([0.0, 0.0, angle]);
-    vec![(add(PIVOT, scale(down, 0.5 * LENGTH)), r), (add(PIVOT, scale(down, LENGTH)), r)]
-}
-
-fn rod_and_bob() -> Vec<Body> {
-    vec![cuboid([0.12, LENGTH, 0.12]), ball(0.34)]
-}
-
 /// A rod with a bob, turning about a pivot: θ'' = −(g/ℓ) sin θ.
 fn pendulum() -> (Vec<Body>, Poses) {
+    const PIVOT: [f64; 3] = [0.0, 2.35, 0.3];
+    const LENGTH: f64 = 1.6;
+    const RATE: f64 = 20.0; // g/ℓ, 1/s²: 45 frames a swing
     const RELEASED: f64 = 0.95;
     let (mut angle, mut speed) = (RELEASED, 0.0);
     let dt = 1.0 / (FPS * SUBSTEPS as f64);
     let mut poses = Vec::new();
     for _ in 0..FRAMES {
-        poses.push(hanging(angle));
+        let down = [angle.sin(), -angle.cos(), 0.0];
+        let r = turned([0.0, 0.0, angle]);
+        poses.push(vec![(add(PIVOT, scale(down, 0.5 * LENGTH)), r), (add(PIVOT, scale(down, LENGTH)), r)]);
         for _ in 0..SUBSTEPS {
             // Leapfrog.
             speed -= 0.5 * dt * RATE * f64::sin(angle);
@@ -147,31 +135,7 @@ fn pendulum() -> (Vec<Body>, Poses) {
             speed -= 0.5 * dt * RATE * f64::sin(angle);
         }
     }
-    (rod_and_bob(), poses)
-}
-
-/// The same with drag and a motor at the pivot, whose torque changes every few frames: θ'' = −(g/ℓ) sin θ − c θ' + u.
-fn driven_pendulum() -> (Vec<Body>, Poses, Actions) {
-    const DRAG: f64 = 0.8; // 1/s
-    const TORQUE: f64 = 14.0; // 1/s²
-    let rng = Rng::new(11, "torques", 0);
-    let (mut angle, mut speed, mut torque, mut until) = (0.3, 0.0f64, 0.0, 0);
-    let dt = 1.0 / (FPS * SUBSTEPS as f64);
-    let (mut poses, mut rows) = (Vec::new(), Vec::new());
-    for t in 0..FRAMES {
-        if t == until {
-            let k = 3 * t as u64;
-            until = t + 5 + rng.below(k, 9);
-            torque = TORQUE * (2.0 * rng.uniform(k + 1) - 1.0);
-        }
-        poses.push(hanging(angle));
-        rows.push(vec![torque]);
-        for _ in 0..SUBSTEPS {
-            speed += dt * (torque - RATE * f64::sin(angle) - DRAG * speed);
-            angle += dt * speed;
-        }
-    }
-    (rod_and_bob(), poses, Actions { names: vec!["torque".into()], rows })
+    (vec![cuboid([0.12, LENGTH, 0.12]), ball(0.34)], poses)
 }
 
 /// A box that drives round and round.
@@ -214,6 +178,50 @@ fn pushed_block() -> (Vec<Body>, Poses, Actions) {
     }
     let names = ["push.x", "push.y", "push.z"].map(String::from).to_vec();
     (vec![cuboid([0.8, 0.7, 0.6])], poses, Actions { names, rows })
+}
+
+/// Two balls on a spring in wind, which moves the light one twice as much; it changes every few frames.
+fn wind() -> (Vec<Body>, Poses, Actions) {
+    const RADII: [f64; 2] = [0.25, 0.35];
+    const CAUGHT: [f64; 2] = [2.0, 1.0];
+    const WIND: f64 = 3.0; // scene units per second squared
+    const DRAG: f64 = 2.0; // 1/s
+    const STIFF: f64 = 20.0; // 1/s²
+    const LENGTH: f64 = 1.0;
+    const REACH: f64 = 0.6;
+    const MIDDLE: [f64; 3] = [0.0, 1.3, 0.3];
+    let rng = Rng::new(13, "wind", 0);
+    let mut x = [-0.5, 0.5].map(|side| add(MIDDLE, [side * LENGTH, 0.0, 0.0]));
+    let (mut v, mut blows, mut until) = ([[0.0; 3]; 2], [0.0; 3], 0);
+    let dt = 1.0 / (FPS * SUBSTEPS as f64);
+    let (mut poses, mut rows) = (Vec::new(), Vec::new());
+    for t in 0..FRAMES {
+        if t == until {
+            let k = 4 * t as u64;
+            until = t + 4 + rng.below(k, 6);
+            blows = [1, 2, 3].map(|c| WIND * (2.0 * rng.uniform(k + c) - 1.0));
+            // Back to the middle where they would leave.
+            for c in 0..3 {
+                let off = 0.5 * (x[0][c] + x[1][c]) - MIDDLE[c];
+                if off.abs() > 0.5 * REACH && off * blows[c] > 0.0 {
+                    blows[c] = -blows[c];
+                }
+            }
+        }
+        poses.push(x.iter().map(|x| (*x, IDENTITY)).collect());
+        rows.push(blows.to_vec());
+        for _ in 0..SUBSTEPS {
+            let apart = sub(x[1], x[0]);
+            let pull = scale(apart, STIFF * (1.0 - LENGTH / norm(apart)));
+            for (i, side) in [1.0, -1.0].into_iter().enumerate() {
+                let a = add(add(scale(blows, CAUGHT[i]), scale(v[i], -DRAG)), scale(pull, side));
+                v[i] = add(v[i], scale(a, dt));
+                x[i] = add(x[i], scale(v[i], dt));
+            }
+        }
+    }
+    let names = ["wind.x", "wind.y", "wind.z"].map(String::from).to_vec();
+    (RADII.map(ball).to_vec(), poses, Actions { names, rows })
 }
 
 /// A ball that loses a fifth of its speed at every bounce.
