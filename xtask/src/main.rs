@@ -64,7 +64,7 @@ chores:
        \
                                            draws a world of known physics for `splat4d predict`: pendulum, circle, \
                      pushed-block, bounce,
-                             rolling, collision or cloth; true paths of \
+                             rolling, collision, cloth or driven-pendulum; true paths of \
                      its nodes and actions next to it, with --truth also depth, flow and labels
   capture --long SECONDS FOLDER [--size WxH] [--cameras N]
                              draws a take of any length, 30 frames a second, with images of any size (default 200x150) from N cameras \

@@ -8,7 +8,7 @@
 //!
 //! Re z < 0, so that |e^z| < 1: memory fades for any weights. It depends on the past alone.
 
-use crate::learnt::{Action, Network, Scales, State, put, row};
+use crate::learnt::{Action, InputGrads, Network, Scales, State, put, row};
 use crate::optimise::no_gaussians;
 use crate::paths::{Moment, nearest};
 use splat4d::Result;
@@ -227,10 +227,11 @@ impl Network for CausalNet {
         p: &Params<F>,
         tick: &Tick<F>,
         d_a: &[F],
-        d_state: &mut State<F>,
+        d_inputs: InputGrads<'_, F>,
         d_hidden: &mut Vec<F>,
         d: &mut Grads<F>,
     ) {
+        let InputGrads { state: d_state, actions: d_actions } = d_inputs;
         let (rows, c, o, inputs) = (tick.state.x.len() / 3, self.spec.channels, self.spec.outputs, self.inputs());
         let (steps, big, n) = (self.steps(p), F::of(self.scales.acceleration), self.near.len());
         let [drive, read, skip] = [self.drive, self.read, self.skip].map(|k| p[k].data());
@@ -285,6 +286,10 @@ impl Network for CausalNet {
             }
             let [l, v1] = [self.scales.length, self.scales.velocity].map(|x| F::of(1.0 / x));
             let share = F::of(1.0 / self.near[i % n].len().max(1) as f64);
+            let d_action = &mut d_actions[i / n];
+            d_u[INPUTS..].iter().enumerate().for_each(|(u, d_u)| put(d_action, u, F::ONE, *d_u));
+            let scalars = &d_inv[2 * o + EMBEDDING..];
+            d_action[3 * self.spec.actions[0]..].iter_mut().zip(scalars).for_each(|(d, g)| *d += *g);
             put(&mut d_state.v, i, v1, d_u[0]);
             for &j in &self.near[i % n] {
                 let j = i - i % n + j;
@@ -380,7 +385,7 @@ mod tests {
         let truth = (0..4).map(|h| near(60 + h)).collect();
         let mut w = Window { before, state: state(5), actions: vec![act; 4], truth };
         let mut d = Grads::new(&p);
-        let (_, d_state) = rollout_loss(&net, &p, &w, Some(&mut d));
+        let (_, d_state, d_actions) = rollout_loss(&net, &p, &w, Some(&mut d));
         let mut checked = 0;
         for key in p.keys().filter(|&k| p[k].rows() > 0).collect::<Vec<_>>() {
             let rows = p[key].rows();
@@ -408,6 +413,20 @@ mod tests {
                 let slope = (at(H) - at(-H)) / (2.0 * H);
                 let found = [&d_state.x, &d_state.v][part][i];
                 assert!((found - slope).abs() < 1e-6 * (1.0 + slope.abs()), "state {part} {i}: {found}, {slope}");
+            }
+        }
+        w.state = state(5);
+        for h in 0..w.actions.len() {
+            for i in 0..ACTION.len() {
+                let mut at = |x: f64| {
+                    w.actions[h][0][i] = ACTION[i] + x;
+                    rollout_loss(&net, &p, &w, None).0
+                };
+                let slope = (at(H) - at(-H)) / (2.0 * H);
+                at(0.0);
+                let found = d_actions[h][0][i];
+                assert!((found - slope).abs() < 1e-6 * (1.0 + slope.abs()), "action {h} {i}: {found}, {slope}");
+                assert!(slope.abs() > 1e-9, "the action matters");
             }
         }
     }

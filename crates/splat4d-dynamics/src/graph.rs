@@ -16,7 +16,7 @@
 #[cfg(test)]
 mod tests;
 
-use crate::learnt::{Action, Network, Scales, State, put, row};
+use crate::learnt::{Action, InputGrads, Network, Scales, State, put, row};
 use crate::optimise::no_gaussians;
 use crate::paths::{Moment, nearest};
 use splat4d::Result;
@@ -232,7 +232,8 @@ impl GraphNet {
         a
     }
 
-    fn own_inputs_backward<F: Real>(&self, step: &Step<F>, d_x: &[F], d_state: &mut State<F>, d: &mut Grads<F>) {
+    fn own_inputs_backward<F: Real>(&self, step: &Step<F>, d_x: &[F], to: InputGrads<'_, F>, d: &mut Grads<F>) {
+        let InputGrads { state: d_state, actions: d_actions } = to;
         let (n, [vectors, scalars]) = (self.ties.len(), self.spec.actions);
         let [l, v1] = [self.scales.length, self.scales.velocity].map(|x| F::of(1.0 / x));
         let g = self.gravity();
@@ -246,9 +247,14 @@ impl GraphNet {
             if self.spec.floor.is_some() {
                 put(&mut d_state.x, i, -own[2] * l, g);
             }
+            let (action, d_action) = (&step.actions[i / n], &mut d_actions[i / n]);
             for u in 0..vectors {
-                put(&mut d_state.v, i, own[OWN + 2 * u + 1] * v1, row(&step.actions[i / n], u));
+                let [d_square, d_along] = [own[OWN + 2 * u], own[OWN + 2 * u + 1]];
+                put(&mut d_state.v, i, d_along * v1, row(action, u));
+                put(d_action, u, F::TWO * d_square, row(action, u));
+                put(d_action, u, d_along * v1, row(&step.state.v, i));
             }
+            d_action[3 * vectors..].iter_mut().zip(&own[OWN + 2 * vectors..]).for_each(|(d, g)| *d += *g);
         }
     }
 }
@@ -319,10 +325,11 @@ impl Network for GraphNet {
         p: &Params<F>,
         step: &Step<F>,
         d_a: &[F],
-        d_state: &mut State<F>,
+        d_inputs: InputGrads<'_, F>,
         _d_hidden: &mut Vec<F>,
         d: &mut Grads<F>,
     ) {
+        let InputGrads { state: d_state, actions: d_actions } = d_inputs;
         let (s, w, rows) = (&step.state, self.spec.width, step.state.x.len() / 3);
         let [vectors, _] = self.spec.actions;
         let (big, v1, g) = (F::of(self.scales.acceleration), F::of(1.0 / self.scales.velocity), self.gravity());
@@ -342,7 +349,10 @@ impl Network for GraphNet {
                 let d_a = row(d_a, i);
                 d_c[0] = big * v1 * dot(d_a, row(&s.v, i));
                 d_c[1] = big * dot(d_a, g);
-                (0..vectors).for_each(|u| d_c[2 + u] = big * dot(d_a, row(&step.actions[i / self.ties.len()], u)));
+                for u in 0..vectors {
+                    d_c[2 + u] = big * dot(d_a, row(&step.actions[i / self.ties.len()], u));
+                    put(&mut d_actions[i / self.ties.len()], u, big * c[2 + u], d_a);
+                }
                 put(&mut d_state.v, i, big * v1 * c[0], d_a);
             }
             d_h = back(&self.own, &d_own, d);
@@ -389,7 +399,7 @@ impl Network for GraphNet {
             }
         }
         let d_x = back(&self.first, &d_h, d);
-        self.own_inputs_backward(step, &d_x, d_state, d);
+        self.own_inputs_backward(step, &d_x, InputGrads { state: d_state, actions: d_actions }, d);
     }
 }
 

@@ -42,6 +42,15 @@ impl<F: Real> State<F> {
 /// Scaled inputs of a copy: vectors \[3 each], then scalars.
 pub type Action<F> = Vec<F>;
 
+/// Gradients to the inputs of a tick.
+#[derive(Debug)]
+pub struct InputGrads<'a, F> {
+    /// To positions and velocities.
+    pub state: &'a mut State<F>,
+    /// To the scaled actions, one a copy.
+    pub actions: &'a mut [Action<F>],
+}
+
 /// A network whose weights are in a [`Params`].
 pub trait Network: Clone {
     /// State for a step's backward.
@@ -69,14 +78,14 @@ pub trait Network: Clone {
         hidden: &mut Vec<F>,
         tape: &mut Self::Tape<F>,
     ) -> Vec<F>;
-    /// The VJP of [`accelerations`](Self::accelerations): adds to `d_state` and the weights' gradients, and turns the
-    /// gradient to `hidden` after the tick into that before it.
+    /// The VJP of [`accelerations`](Self::accelerations): adds to the gradients of state, actions (one a copy) and
+    /// weights, and turns the gradient to `hidden` after the tick into that before it.
     fn backward<F: Real>(
         &self,
         p: &Params<F>,
         tape: &Self::Tape<F>,
         d_a: &[F],
-        d_state: &mut State<F>,
+        d_inputs: InputGrads<'_, F>,
         d_hidden: &mut Vec<F>,
         d: &mut Grads<F>,
     );
@@ -132,12 +141,12 @@ const STILLEST: f64 = 1e-6;
 /// A trained network.
 #[derive(Clone, Debug)]
 pub struct Learnt<N> {
-    net: N,
+    pub(crate) net: N,
     /// Its weights.
     pub params: Params<f32>,
     /// One over the size of each vector and scalar of an action.
-    units: Vec<f64>,
-    columns: (Vec<usize>, Vec<usize>),
+    pub(crate) units: Vec<f64>,
+    pub(crate) columns: (Vec<usize>, Vec<usize>),
     steepest: f64,
     /// Mean loss of the last tenth of training.
     pub loss: f64,
@@ -201,7 +210,18 @@ impl<N: Network> Learnt<N> {
             let horizon = HORIZONS[stage].min(paths.len() - 2 - self.warm_up(paths));
             let rng = Rng::new(training.seed, "windows", step as u64);
             let noise = NOISE.map(|n| n * (1.0 - done / NOISE_UNTIL).max(0.0));
-            let window = self.window(paths, actions, horizon, graphs, noise, rng);
+            // The first tick has no velocity.
+            let earliest = 1 + self.warm_up(paths);
+            let starts: Vec<usize> =
+                (0..graphs).map(|g| earliest + rng.below(g as u64, paths.len() - earliest - horizon)).collect();
+            let mut window = self.window(paths, &starts, horizon, |tick| self.action(actions, tick));
+            let scales = self.net.scales();
+            let sizes = [scales.length, scales.velocity];
+            let State { x, v } = &mut window.state;
+            for (part, numbers) in [x, v].into_iter().enumerate() {
+                let (rng, size) = (rng.fork(part as u64), (noise[part] * sizes[part]) as f32);
+                numbers.iter_mut().enumerate().for_each(|(i, x)| *x += size * rng.normal(i as u64) as f32);
+            }
             let net = &self.net;
             let mut loss = 0.0;
             optimiser.step(&mut self.params, done, |p, d| loss = rollout_loss(net, p, &window, Some(d)).0.f64());
@@ -213,25 +233,20 @@ impl<N: Network> Learnt<N> {
         self.loss = sum / f64::from(count.max(1));
     }
 
-    fn window(
+    /// Windows of this many frames from observed states, side by side. `action`: the scaled action after a tick.
+    pub(crate) fn window(
         &self,
         paths: &Paths,
-        actions: Option<&Actions>,
+        starts: &[usize],
         horizon: usize,
-        graphs: usize,
-        noise: [f64; 2],
-        rng: Rng,
+        action: impl Fn(usize) -> Action<f32>,
     ) -> Window<f32> {
         let n = paths.nodes();
-        // The first tick has no velocity.
-        let earliest = 1 + self.warm_up(paths);
-        let starts: Vec<usize> =
-            (0..graphs).map(|g| earliest + rng.below(g as u64, paths.len() - earliest - horizon)).collect();
+        let tick = |start: &usize, h: isize| start.checked_add_signed(h).expect("a window begins after its warm-up");
         let state = |h: isize| {
             let mut out = State::default();
-            for &start in &starts {
+            for tick in starts.iter().map(|start| tick(start, h)) {
                 for k in 0..n {
-                    let tick = start.checked_add_signed(h).expect("a window begins after its warm-up");
                     let (x, before) = (paths.moments[tick][k].x, paths.moments[tick - 1][k].x);
                     out.x.extend(x.map(|x| x as f32));
                     out.v.extend(sub(x, before).map(|x| x as f32));
@@ -239,33 +254,35 @@ impl<N: Network> Learnt<N> {
             }
             out
         };
-        let mut first = state(0);
-        let scales = self.net.scales();
-        let sizes = [scales.length, scales.velocity];
-        for (part, numbers) in [&mut first.x, &mut first.v].into_iter().enumerate() {
-            let (rng, size) = (rng.fork(part as u64), (noise[part] * sizes[part]) as f32);
-            numbers.iter_mut().enumerate().for_each(|(i, x)| *x += size * rng.normal(i as u64) as f32);
-        }
-        let acts = |h: isize| {
-            let act = |s: &usize| self.action(actions, s.checked_add_signed(h).expect("as above"));
-            starts.iter().map(act).collect::<Vec<_>>()
-        };
+        let acts = |h: isize| starts.iter().map(|start| action(tick(start, h))).collect::<Vec<_>>();
         let before = (1..=self.warm_up(paths) as isize).rev().map(|h| (state(-h), acts(-h))).collect();
         let actions = (0..horizon as isize).map(acts).collect();
-        Window { before, state: first, actions, truth: (1..=horizon as isize).map(state).collect() }
+        Window { before, state: state(0), actions, truth: (1..=horizon as isize).map(state).collect() }
     }
 
     /// Ticks before a window: as many as the network needs, and at most a third of what there is.
-    fn warm_up(&self, paths: &Paths) -> usize {
+    pub(crate) fn warm_up(&self, paths: &Paths) -> usize {
         self.net.warm_up().min(paths.len() / 3)
     }
 
     /// The scaled action between a tick and the next.
-    fn action(&self, actions: Option<&Actions>, tick: usize) -> Action<f32> {
+    pub(crate) fn action(&self, actions: Option<&Actions>, tick: usize) -> Action<f32> {
         let Some(row) = actions.map(|a| &a.rows[tick]) else { return Vec::new() };
         let (vectors, scalars) = &self.columns;
         let parts = vectors.iter().map(|&c| &row[c..c + 3]).chain(scalars.iter().map(|&c| &row[c..=c]));
         parts.zip(&self.units).flat_map(|(part, unit)| part.iter().map(move |x| (x * unit) as f32)).collect()
+    }
+
+    /// The row of a table, of this many columns, that has a scaled action.
+    pub(crate) fn unscaled(&self, action: &[f64], columns: usize) -> Vec<f64> {
+        let (vectors, scalars) = &self.columns;
+        let mut out = vec![0.0; columns];
+        let places = vectors.iter().map(|&c| c..c + 3).chain(scalars.iter().map(|&c| c..c + 1));
+        let mut numbers = action.iter();
+        for (place, unit) in places.zip(&self.units) {
+            out[place].iter_mut().zip(&mut numbers).for_each(|(to, x)| *to = x / unit);
+        }
+        out
     }
 
     /// The times after the last of `paths`; row t of the actions acts after tick t.
@@ -330,13 +347,14 @@ fn units(actions: &Actions, (vectors, scalars): &(Vec<usize>, Vec<usize>), ticks
     vectors.iter().map(|&c| size(c..c + 3)).chain(scalars.iter().map(|&c| size(c..c + 1))).collect()
 }
 
-/// The loss of a rollout from a window's start, and with `d` the gradient to the weights and to the start.
+/// The loss of a rollout from a window's start, and with `d` the gradient to the weights, to the start and to the
+/// actions of every frame.
 pub(crate) fn rollout_loss<N: Network, F: Real>(
     net: &N,
     p: &Params<F>,
     w: &Window<F>,
     d: Option<&mut Grads<F>>,
-) -> (F, State<F>) {
+) -> (F, State<F>, Vec<Vec<Action<F>>>) {
     let mut state = w.state.clone();
     let (rows, length) = (state.x.len() / 3, net.scales().length);
     let mut hidden = vec![F::ZERO; rows * net.memory()];
@@ -363,23 +381,27 @@ pub(crate) fn rollout_loss<N: Network, F: Real>(
         errors.push(error);
     }
     let mut d_state = State::zeros(rows);
+    let zeros = |actions: &Vec<Action<F>>| actions.iter().map(|a| vec![F::ZERO; a.len()]).collect::<Vec<_>>();
+    let mut d_actions: Vec<Vec<Action<F>>> = w.actions.iter().map(zeros).collect();
     if let Some(d) = d {
         let mut d_hidden = vec![F::ZERO; hidden.len()];
-        for (tape, error) in tapes.iter().zip(&errors).rev() {
+        for ((tape, error), d_actions) in tapes.iter().zip(&errors).zip(&mut d_actions).rev() {
             for i in 0..3 * rows {
                 d_state.x[i] += error.x[i];
                 d_state.v[i] += error.v[i] + d_state.x[i];
             }
             let d_a = d_state.v.clone();
-            net.backward(p, tape, &d_a, &mut d_state, &mut d_hidden, d);
+            net.backward(p, tape, &d_a, InputGrads { state: &mut d_state, actions: d_actions }, &mut d_hidden, d);
         }
         // Observations have no gradient, but the memory state depends on the weights.
         let (nothing, mut unused) = (vec![F::ZERO; 3 * rows], State::zeros(rows));
-        for tape in warm.iter().rev() {
-            net.backward(p, tape, &nothing, &mut unused, &mut d_hidden, d);
+        for (tape, (_, actions)) in warm.iter().zip(&w.before).rev() {
+            let mut d_actions = zeros(actions);
+            let d_inputs = InputGrads { state: &mut unused, actions: &mut d_actions };
+            net.backward(p, tape, &nothing, d_inputs, &mut d_hidden, d);
         }
     }
-    (loss, d_state)
+    (loss, d_state, d_actions)
 }
 
 /// weight · Σ ρ(|found − truth|) over rows, and its gradient; ρ is half the square below [`HUBER`] · length, in its

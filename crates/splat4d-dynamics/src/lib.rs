@@ -21,6 +21,7 @@
 //! | `ballistic.rs`, `koopman.rs` | baselines that learn nothing; optimised dynamic mode decomposition, stable by construction |
 //! | `learnt.rs` | the contract of a network that predicts accelerations, its training over whole rollouts, its forecasts |
 //! | `causal.rs`, `graph.rs`, `graph/` | the two networks: equivariant state space, equivariant messages along edges |
+//! | `inverse.rs`, `inverse/` | inverse dynamics: actions that led from one state to the next |
 //! | `models.rs`, `models/` | the models, by name |
 //! | `score.rs` | node errors, skill, win rates, divergence, ensembles and their calibration |
 //! | `nodes.rs`, `nodes/` | nodes with identity on dynamic regions, followed through any motion model |
@@ -33,6 +34,7 @@ mod ballistic;
 pub mod causal;
 pub mod future;
 pub mod graph;
+mod inverse;
 mod koopman;
 pub mod learnt;
 mod matrix;

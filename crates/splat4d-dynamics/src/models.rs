@@ -4,6 +4,7 @@ use crate::actions::Actions;
 use crate::ballistic::{DAMPING, ballistic, freeze};
 use crate::causal::{CausalNet, CausalSpec};
 use crate::graph::{GraphNet, GraphSpec};
+use crate::inverse::infer;
 use crate::koopman::Koopman;
 use crate::learnt::{LEAST_TICKS, Learnt, Network, Training};
 use crate::paths::{Moment, Paths};
@@ -144,6 +145,18 @@ impl Fitted {
             Self::Koopman(model) => model.0.rollout(paths, horizon),
             Self::Causal(model) => model.rollout(paths, actions, horizon),
             Self::Graph(model) => model.rollout(paths, actions, horizon),
+        }
+    }
+
+    /// The actions that led through `paths` after the last `known` row, each constant over `hold` frames, behind the
+    /// known ones: row t acts between tick t and the next.
+    ///
+    /// Errors: the model takes no actions, or was not trained with these columns; `hold` is 0; too few rows are known.
+    pub fn infer_actions(&self, paths: &Paths, known: &Actions, hold: usize) -> Result<Actions> {
+        match self {
+            Self::Causal(model) => infer(model, paths, known, hold),
+            Self::Graph(model) => infer(model, paths, known, hold),
+            _ => Err(Error::input("this model takes no actions").remedy("Use causal or graph")),
         }
     }
 

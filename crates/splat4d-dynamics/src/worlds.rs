@@ -12,7 +12,8 @@ pub const FPS: f64 = 30.0;
 /// Frames of a world.
 pub const FRAMES: usize = 150;
 /// Names of all worlds.
-pub const NAMES: [&str; 7] = ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth"];
+pub const NAMES: [&str; 8] =
+    ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth", "driven-pendulum"];
 /// Scene units per second squared.
 const GRAVITY: f64 = 9.81;
 /// Steps of integration a frame.
@@ -64,8 +65,8 @@ impl World {
         let (bodies, poses) = match name {
             "pendulum" => pendulum(),
             "circle" => circle(),
-            "pushed-block" => {
-                let (bodies, poses, actions) = pushed_block();
+            "pushed-block" | "driven-pendulum" => {
+                let (bodies, poses, actions) = if name == "pushed-block" { pushed_block() } else { driven_pendulum() };
                 return Ok(Self { name: name.into(), bodies, poses, cloth: Vec::new(), actions: Some(actions) });
             }
             "bounce" => bounce(),
@@ -115,19 +116,30 @@ fn cuboid(sides: [f64; 3]) -> Body {
     Body { shape: Shape::Box(sides), points: (0..8).map(corner).collect() }
 }
 
+/// A rod of a pendulum, its pivot, and g/ℓ, 1/s²: 45 frames a swing.
+const PIVOT: [f64; 3] = [0.0, 2.35, 0.3];
+const LENGTH: f64 = 1.6;
+const RATE: f64 = 20.0;
+
+/// Rod and bob at an angle.
+fn hanging(angle: f64) -> Vec<Pose> {
+    let down = [angle.sin(), -angle.cos(), 0.0];
+    let r = turned([0.0, 0.0, angle]);
+    vec![(add(PIVOT, scale(down, 0.5 * LENGTH)), r), (add(PIVOT, scale(down, LENGTH)), r)]
+}
+
+fn rod_and_bob() -> Vec<Body> {
+    vec![cuboid([0.12, LENGTH, 0.12]), ball(0.34)]
+}
+
 /// A rod with a bob, turning about a pivot: θ'' = −(g/ℓ) sin θ.
 fn pendulum() -> (Vec<Body>, Poses) {
-    const PIVOT: [f64; 3] = [0.0, 2.35, 0.3];
-    const LENGTH: f64 = 1.6;
-    const RATE: f64 = 20.0; // g/ℓ, 1/s²: 45 frames a swing
     const RELEASED: f64 = 0.95;
     let (mut angle, mut speed) = (RELEASED, 0.0);
     let dt = 1.0 / (FPS * SUBSTEPS as f64);
     let mut poses = Vec::new();
     for _ in 0..FRAMES {
-        let down = [angle.sin(), -angle.cos(), 0.0];
-        let r = turned([0.0, 0.0, angle]);
-        poses.push(vec![(add(PIVOT, scale(down, 0.5 * LENGTH)), r), (add(PIVOT, scale(down, LENGTH)), r)]);
+        poses.push(hanging(angle));
         for _ in 0..SUBSTEPS {
             // Leapfrog.
             speed -= 0.5 * dt * RATE * f64::sin(angle);
@@ -135,7 +147,31 @@ fn pendulum() -> (Vec<Body>, Poses) {
             speed -= 0.5 * dt * RATE * f64::sin(angle);
         }
     }
-    (vec![cuboid([0.12, LENGTH, 0.12]), ball(0.34)], poses)
+    (rod_and_bob(), poses)
+}
+
+/// The same with drag and a motor at the pivot, whose torque changes every few frames: θ'' = −(g/ℓ) sin θ − c θ' + u.
+fn driven_pendulum() -> (Vec<Body>, Poses, Actions) {
+    const DRAG: f64 = 0.8; // 1/s
+    const TORQUE: f64 = 14.0; // 1/s²
+    let rng = Rng::new(11, "torques", 0);
+    let (mut angle, mut speed, mut torque, mut until) = (0.3, 0.0f64, 0.0, 0);
+    let dt = 1.0 / (FPS * SUBSTEPS as f64);
+    let (mut poses, mut rows) = (Vec::new(), Vec::new());
+    for t in 0..FRAMES {
+        if t == until {
+            let k = 3 * t as u64;
+            until = t + 5 + rng.below(k, 9);
+            torque = TORQUE * (2.0 * rng.uniform(k + 1) - 1.0);
+        }
+        poses.push(hanging(angle));
+        rows.push(vec![torque]);
+        for _ in 0..SUBSTEPS {
+            speed += dt * (torque - RATE * f64::sin(angle) - DRAG * speed);
+            angle += dt * speed;
+        }
+    }
+    (rod_and_bob(), poses, Actions { names: vec!["torque".into()], rows })
 }
 
 /// A box that drives round and round.

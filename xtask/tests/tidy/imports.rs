@@ -60,6 +60,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "learnt",
             "causal",
             "graph",
+            "inverse",
             "models",
             "score",
             "nodes",

@@ -117,7 +117,7 @@ fn gradients_through_a_rollout_are_those_of_finite_differences() {
         truth: (0..HORIZON as u64).map(|h| noisy(20 + h)).collect(),
     };
     let mut d = Grads::new(&p);
-    let (_, d_state) = rollout_loss(&net, &p, &w, Some(&mut d));
+    let (_, d_state, d_actions) = rollout_loss(&net, &p, &w, Some(&mut d));
     let mut checked = 0;
     for key in p.keys().filter(|&k| p[k].rows() > 0).collect::<Vec<_>>() {
         let rows = p[key].rows();
@@ -145,6 +145,20 @@ fn gradients_through_a_rollout_are_those_of_finite_differences() {
             let slope = (at(H) - at(-H)) / (2.0 * H);
             let found = [&d_state.x, &d_state.v][part][i];
             assert!((found - slope).abs() < 1e-6 * (1.0 + slope.abs()), "state {part} {i}: {found}, {slope}");
+        }
+    }
+    w.state = state.clone();
+    for h in 0..w.actions.len() {
+        for i in 0..ACTION.len() {
+            let mut at = |x: f64| {
+                w.actions[h][0][i] = ACTION[i] + x;
+                rollout_loss(&net, &p, &w, None).0
+            };
+            let slope = (at(H) - at(-H)) / (2.0 * H);
+            at(0.0);
+            let found = d_actions[h][0][i];
+            assert!((found - slope).abs() < 1e-6 * (1.0 + slope.abs()), "action {h} {i}: {found}, {slope}");
+            assert!(slope.abs() > 1e-9, "the action matters");
         }
     }
 }

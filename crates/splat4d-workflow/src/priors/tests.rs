@@ -1,5 +1,6 @@
 use super::*;
 use crate::events::{Event, ignore};
+use crate::models::Map;
 use crate::models::tests::onnx::{IMAGES, of_channel, of_means, of_points};
 use splat4d_train::capture::{DepthKind, ImageStore};
 use std::cell::RefCell;
@@ -223,4 +224,25 @@ fn networks_of_another_kind_are_refused() {
     );
     let text = place.run(&[]).unwrap_err().to_string();
     assert!(text.contains("no network"), "{text}");
+}
+
+#[test]
+fn flow_is_unknown_where_the_flow_back_disagrees() {
+    let size = (WIDTH, 4);
+    let map = |u: &dyn Fn(usize) -> f32| {
+        let values = (0..2 * size.0 * size.1).map(|i| if i < size.0 * size.1 { u(i % size.0) } else { 0.0 }).collect();
+        Map { channels: 2, height: size.1, width: size.0, values }
+    };
+    // All pixels move by 5 to the right. Columns 20 to 24 of the next image show what was hidden: their flow back is that of
+    // something else, so that columns 15 to 19 of this image are not seen there.
+    let forth = map(&|_| 5.0);
+    let back = map(&|x| if (20..25).contains(&x) { 1.0 } else { -5.0 });
+    let write::Encoded::File(png) = write::flow(&forth, &back) else { panic!("flow is finite") };
+    let decoded = image::load_from_memory(&png).unwrap().into_rgb16();
+    for x in 0..WIDTH {
+        let [u, _, known] = decoded.get_pixel(x as u32, 2).0;
+        let hidden = (15..20).contains(&x) || x + 5 >= WIDTH;
+        assert_eq!(known, u16::from(!hidden), "column {x}");
+        assert_eq!(u, if hidden { 0 } else { 32768 + 5 * 64 }, "column {x}");
+    }
 }
