@@ -1,6 +1,7 @@
 //! What is learnt of cameras, through a whole step: the gradients that Adam gets against central differences.
 
 use super::*;
+use crate::capture::Lens;
 use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
 
 /// Half the step of the differences, a power of two: of numbers that are kept in f32 it makes exact neighbours.
