@@ -4,7 +4,6 @@
 //! A pixel whose channels are all 0 is unknown.
 
 use super::json;
-use super::lens::Distortion;
 use super::{Capture, Frame, picture};
 use splat4d::format::npy::Npy;
 use splat4d::scene::features::MOST_CHANNELS;
