@@ -34,12 +34,17 @@ const EXPOSURE: f64 = 1.0 / 40.0;
 /// Automatic exposure: share by which the light changes, rounds in a second, and their difference between channels.
 const DRIFT: [f64; 3] = [0.25, 0.6, 0.06];
 
+/// Light at the squared radius r, 1 in the corners: 1 + k1 r + k2 r² + k3 r³, as `vignetting` of `capture.json`. A fast
+/// wide-angle lens, wide open.
+const VIGNETTING: [f64; 3] = [-0.35, -0.2, 0.1];
+
 /// Which faults cameras have.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Faults {
     rolling: bool,
     blur: bool,
     drift: bool,
+    vignetting: bool,
 }
 
 impl Faults {
@@ -51,7 +56,10 @@ impl Faults {
                 "rolling" => all.rolling = true,
                 "blur" => all.blur = true,
                 "drift" => all.drift = true,
-                _ => bail!("unknown fault `{word}`: none, rolling, blur and drift are possible, joined by commas"),
+                "vignetting" => all.vignetting = true,
+                _ => bail!(
+                    "unknown fault `{word}`: none, rolling, blur, drift and vignetting are possible, joined by commas"
+                ),
             }
         }
         Ok(all)
@@ -82,6 +90,15 @@ impl Faults {
         let lit = |&row: &usize| self.weight(step - n * STEPS - self.row(row, height)) > 0.0;
         let first = (0..height).find(lit);
         first.map_or(0..0, |first| first..(0..height).rev().find(lit).map_or(first, |last| last + 1))
+    }
+
+    /// Share of light that a pixel of an image of this size receives.
+    fn light(self, pixel: usize, [width, height]: [usize; 2]) -> f64 {
+        let (w, h) = (width as f64, height as f64);
+        let (x, y) = ((pixel % width) as f64 + 0.5 - 0.5 * w, (pixel / width) as f64 + 0.5 - 0.5 * h);
+        let r2 = 4.0 * (x * x + y * y) / (w * w + h * h);
+        let [k1, k2, k3] = VIGNETTING;
+        if self.vignetting { 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)) } else { 1.0 }
     }
 
     /// Factors of the light of frame `n` of a camera.
@@ -137,9 +154,11 @@ pub(crate) fn command(faults: &str, folder: &Path, options: &[String]) -> Result
             while let Some(n) = open.first_key_value().map(|(n, _)| *n).filter(|n| n * STEPS + last <= step) {
                 let gains = faults.gains(c, n);
                 let image = open.remove(&n).context("the frame was there")?;
-                let code =
-                    |color: &V3| std::array::from_fn::<u8, 3, _>(|k| srgb_from_linear(color.array()[k] * gains[k]));
-                let rgb: Vec<u8> = image.iter().flat_map(code).collect();
+                let code = |(pixel, color): (usize, &V3)| {
+                    let light = faults.light(pixel, [width, height]);
+                    std::array::from_fn::<u8, 3, _>(|k| srgb_from_linear(color.array()[k] * gains[k] * light))
+                };
+                let rgb: Vec<u8> = image.iter().enumerate().flat_map(code).collect();
                 write_file(&folder.join(format!("images/{}/{n:04}.jpg", camera.name)), &jpeg(&rgb, width, height)?)?;
             }
             Ok(())
@@ -168,6 +187,9 @@ fn entry(camera: &Camera, faults: Faults) -> Value {
     }
     if faults.blur {
         entry["exposure_time"] = json!(EXPOSURE);
+    }
+    if faults.vignetting {
+        entry["vignetting"] = json!(VIGNETTING);
     }
     entry
 }
@@ -203,6 +225,10 @@ mod tests {
                 assert_eq!(lit, 2 * faults.reach() + 1, "{text}, row {row}");
             }
         }
+        let lens = Faults::read("vignetting").unwrap();
+        let corner = lens.light(0, [200, 150]);
+        assert!(corner < 0.57 && lens.light(75 * 200 + 100, [200, 150]) > 0.999, "{corner}");
+        assert_eq!(Faults::default().light(0, [200, 150]), 1.0);
         assert_eq!(Faults::read("rolling").unwrap().row(149, 150), 7, "half of 30 ms in steps of 1/480 s");
         assert!(Faults::read("rain").unwrap_err().to_string().contains("rolling"));
     }

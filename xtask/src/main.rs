@@ -71,7 +71,8 @@ chores:
                      (default 20); a frame in memory at a time
   capture --film FAULTS FOLDER [--size WxH]
                              draws the scene with ground-truth poses and cameras that are not ideal: FAULTS are rolling (a shutter of
-                             30 ms), blur (exposures of 1/40 s) and drift (of exposure and white balance), joined by commas, or none
+                             30 ms), blur (exposures of 1/40 s), drift (of exposure and white balance) and vignetting (corners lose 45 %), joined by
+                             commas, or none
   strip-character IN.glb OUT.glb CLIP... \
                      [--drop NODE...]
                              keeps the named animation clips of a character, \

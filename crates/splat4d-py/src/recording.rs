@@ -25,14 +25,15 @@ use std::path::PathBuf;
 /// `size` is the shorter side of the images. `crop`: "auto" cuts off black bars, or (width, height, x, y) in pixels of the videos.
 /// `apart`: two cameras and their distance in metres. `board`: tags, such as "36h11:0.16:floor". `camera_height`: a camera and its
 /// height above the floor in metres. `calibration`: lenses and poses from a file or folder of another program. `colmap`: finds them
-/// by the COLMAP program. `points`: a file of points that were clicked in the page of `splat4d import --assist`. `matcher`: a network (`.onnx`)
+/// by the COLMAP program. `points`: a file of points that were clicked in the page of `splat4d import --assist`. `keypoints`:
+/// keypoints of people, a folder as of `--keypoints` or a network (`.onnx`) that finds them. `matcher`: a network (`.onnx`)
 /// that matches two images, for cameras whose features do not match (docs/networks.md), with the name of a ready-made description in
 /// `described` or a file next to it. `masks`: a folder, white where images count. `check`: examine the finished capture too, and write
 /// `import/doctor.html`. Ctrl-C stops; stored results are kept.
 #[pyfunction]
 #[pyo3(signature = (
     videos, out, *, rig="auto", every=1, start=None, end=None, size=SIZE, fps=FPS, sound=true, synchronous=false, crop=None,
-    apart=None, board=None, camera_height=None, calibration=None, colmap=false, points=None, matcher=None, described=None, masks=None, deinterlace=false, png=false,
+    apart=None, board=None, camera_height=None, calibration=None, colmap=false, points=None, keypoints=None, matcher=None, described=None, masks=None, deinterlace=false, png=false,
     check=true
 ))]
 #[allow(clippy::too_many_arguments)]
@@ -55,6 +56,7 @@ pub(crate) fn import_videos(
     calibration: Option<PathBuf>,
     colmap: bool,
     points: Option<PathBuf>,
+    keypoints: Option<PathBuf>,
     matcher: Option<PathBuf>,
     described: Option<&str>,
     masks: Option<PathBuf>,
@@ -84,6 +86,7 @@ pub(crate) fn import_videos(
         calibration,
         colmap,
         points,
+        keypoints: keypoints.map(|path| importing::keypoints(&path, described)).transpose().or_raise()?,
         matcher: matcher.map(|network| importing::matcher(&network, described)).transpose().or_raise()?,
         masks,
         synchronous,

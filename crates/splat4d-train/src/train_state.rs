@@ -10,7 +10,7 @@ mod exposure;
 pub(crate) use corrections::Scale;
 pub use corrections::moved;
 pub use corrections::{Corrections, RefineSettings};
-pub(crate) use corrections::{Origin, SearchDue, StepGrads, zoomed};
+pub(crate) use corrections::{Origin, SearchDue, StepGrads, corner, zoomed};
 pub(crate) use exposure::{COLUMNS as EXPOSURE_COLUMNS, Exposure, expose};
 
 use crate::Result;

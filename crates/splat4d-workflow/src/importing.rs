@@ -9,8 +9,8 @@ use splat4d_import::calibration;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
 use splat4d_import::predicted;
-use splat4d_import::recording::{self, CameraReport, Report, Request};
-use splat4d_import::sfm::learned::{Learned, Matcher, Matches};
+use splat4d_import::recording::{self, CameraReport, Detector, Keypoints, Report, Request};
+use splat4d_import::sfm::learned::{Matcher, Matches};
 use splat4d_train::capture::Rgb8;
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
@@ -80,22 +80,53 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
 /// `described`: the name of a description that the program has, in place of the file next to the network.
 ///
 /// Errors: as of [`Model::load`]; the network does not match images.
-pub fn matcher(network: &Path, described: Option<&str>) -> Result<Arc<Learned>> {
-    let model = Model::load(network, described)?;
-    let kind = model.description().output.kind;
-    if kind != Kind::Matches {
-        return Err(Error::input(format!("the network computes {}, not matches", kind.name()))
-            .at(network.display())
-            .remedy("Give a network that matches two images, such as SuperPoint with LightGlue (docs/networks.md)"));
-    }
-    let identity = model.identity().to_owned();
-    Ok(Arc::new(Learned::new(identity, Box::new(Network(model)))))
+pub fn matcher(network: &Path, described: Option<&str>) -> Result<Arc<dyn Matcher>> {
+    let remedy = "Give a network that matches two images, such as SuperPoint with LightGlue (docs/networks.md)";
+    Ok(Arc::new(Network(loaded(network, described, Kind::Matches, remedy)?)))
 }
 
-/// A network that matches images.
+/// The keypoints of a [`Request`]: a folder of files, or a network (`.onnx`) that finds people, described as of [`matcher`].
+///
+/// Errors: as of [`Model::load`]; the network finds no people.
+pub fn keypoints(path: &Path, described: Option<&str>) -> Result<Keypoints> {
+    if !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("onnx")) {
+        return Ok(Keypoints::Given(path.to_owned()));
+    }
+    let remedy = "Give a network that finds keypoints of all people in an image, such as RTMO (docs/networks.md)";
+    Ok(Keypoints::By(Arc::new(Network(loaded(path, described, Kind::People, remedy)?))))
+}
+
+/// A network of a kind.
+fn loaded(network: &Path, described: Option<&str>, kind: Kind, remedy: &str) -> Result<Model> {
+    let model = Model::load(network, described)?;
+    let found = model.description().output.kind;
+    if found != kind {
+        return Err(Error::input(format!("the network computes {}, not {}", found.name(), kind.name()))
+            .at(network.display())
+            .remedy(remedy));
+    }
+    Ok(model)
+}
+
+/// A network that matches images, or finds people in them.
 struct Network(Model);
 
+impl Detector for Network {
+    fn identity(&self) -> &str {
+        self.0.identity()
+    }
+
+    fn people(&self, image: &Rgb8) -> Result<Vec<Vec<[f64; 3]>>> {
+        let found = self.0.people(image)?.into_iter();
+        Ok(found.map(|person| person.into_iter().map(|point| point.map(f64::from)).collect()).collect())
+    }
+}
+
 impl Matcher for Network {
+    fn identity(&self) -> &str {
+        self.0.identity()
+    }
+
     fn matches(&self, images: [&Rgb8; 2]) -> Result<Matches> {
         Ok(self.0.matches(images)?.into_iter().map(|both| both.map(|at| at.map(f64::from))).collect())
     }

@@ -9,7 +9,7 @@ pub use checks::Row;
 use crate::deadline::unless_stopped;
 use crate::events::Listener;
 use crate::files;
-use crate::models::{Kind, Model};
+use crate::models::{Form, Kind, Model};
 use serde_json::{Map as Object, Value, json};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, CaptureOptions, Frame, Rgb8};
@@ -51,13 +51,14 @@ impl Part {
         }
     }
 
-    /// What a kind of network is used for.
-    pub fn of(kind: Kind) -> Self {
+    /// What a kind of network is used for; keypoints of people are for `import` alone.
+    pub fn of(kind: Kind) -> Option<Self> {
         match kind {
-            Kind::Depth | Kind::InverseDepth => Part::Depth,
-            Kind::Flow => Part::Flow,
-            Kind::Mask => Part::Masks,
-            Kind::Matches => Part::Tracks,
+            Kind::Depth | Kind::InverseDepth => Some(Part::Depth),
+            Kind::Flow => Some(Part::Flow),
+            Kind::Mask => Some(Part::Masks),
+            Kind::Matches => Some(Part::Tracks),
+            Kind::People => None,
         }
     }
 }
@@ -155,7 +156,7 @@ pub fn priors(request: &Priors, stop: &AtomicBool, console: &dyn Listener) -> Re
 fn load(part: Part, path: &Path, described: Option<&str>) -> Result<Model> {
     let model = Model::load(path, described)?;
     let kind = model.description().output.kind;
-    if Part::of(kind) != part {
+    if Part::of(kind) != Some(part) {
         let kinds = match part {
             Part::Depth => "depth or inverse-depth",
             Part::Flow => "flow",
@@ -168,6 +169,13 @@ fn load(part: Part, path: &Path, described: Option<&str>) -> Result<Model> {
                 "Give another one as option `{}`, or correct output.kind in its description",
                 part.name()
             )));
+    }
+    if part == Part::Tracks && model.description().output.form != Form::Numbered {
+        return Err(Error::input("the network finds other positions in every pair of images, which no track connects")
+            .at(path.display())
+            .remedy(
+                "Give one with key points, such as SuperPoint with LightGlue; this one is for `import --matcher`",
+            ));
     }
     Ok(model)
 }

@@ -178,6 +178,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             recorded: None,
             shutter: None,
             vignetting: None,
+            residual: [0.0; 2],
             mask: None,
         }
     };

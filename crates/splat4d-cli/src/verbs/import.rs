@@ -10,7 +10,7 @@ use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_workflow::aligning::Aligning;
-use splat4d_workflow::importing::{import, import_predicted, matcher};
+use splat4d_workflow::importing::{import, import_predicted, keypoints, matcher};
 use splat4d_workflow::parts::left_out;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -94,14 +94,15 @@ pub(crate) struct Args {
     /// Use the clicked points of this file, without a page; with --assist, start the page from it
     #[arg(long, value_name = "FILE", conflicts_with = "colmap")]
     points: Option<PathBuf>,
-    /// Calibrate the cameras by keypoints of people in every frame: a folder with NAME/ or NAME.json of each camera
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["colmap", "points", "assist"])]
+    /// Calibrate the cameras by keypoints of people: a folder with NAME/ or NAME.json of each camera, or a network (.onnx) that
+    /// finds them in the images
+    #[arg(long, value_name = "FOLDER|ONNX", group = "network", conflicts_with_all = ["colmap", "points", "assist"])]
     keypoints: Option<PathBuf>,
     /// A network (.onnx) that matches two images, for cameras whose features do not match
-    #[arg(long, value_name = "ONNX", conflicts_with_all = ["colmap", "points", "assist", "keypoints"])]
+    #[arg(long, value_name = "ONNX", group = "network", conflicts_with_all = ["colmap", "points", "assist", "keypoints"])]
     matcher: Option<PathBuf>,
     /// Ready-made description of the network, in place of the file next to it
-    #[arg(long, value_name = "NAME", requires = "matcher")]
+    #[arg(long, value_name = "NAME", requires = "network")]
     described: Option<String>,
     /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
     #[arg(long, value_name = "FOLDER")]
@@ -196,6 +197,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         console.next("train", &args.output);
         return Ok(());
     }
+    let described = args.described.as_deref();
     let mut request = Request {
         inputs: args.videos.clone(),
         folder: args.output.clone(),
@@ -225,8 +227,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         masks: args.masks.clone(),
         synchronous: args.synchronous,
         points: args.points.clone(),
-        keypoints: args.keypoints.clone(),
-        matcher: args.matcher.as_ref().map(|network| matcher(network, args.described.as_deref())).transpose()?,
+        keypoints: args.keypoints.as_ref().map(|path| keypoints(path, described)).transpose()?,
+        matcher: args.matcher.as_ref().map(|network| matcher(network, described)).transpose()?,
     };
     let stop = interrupt::flag("stopping: stored results are kept");
     if args.assist {

@@ -2,7 +2,7 @@
 
 use crate::console::Console;
 use crate::interrupt;
-use splat4d::Result;
+use splat4d::{Error, Result};
 use splat4d_workflow::models::{Description, PUBLISHED, published};
 use splat4d_workflow::priors::{Part, Priors, priors};
 use std::collections::BTreeMap;
@@ -88,5 +88,9 @@ fn compute(args: &Args, capture: PathBuf, console: &Console) -> anyhow::Result<(
 
 /// What a ready-made description is for. Errors: another name.
 fn part_of(name: &str) -> Result<Part> {
-    Ok(Part::of(Description::parse(published(name)?)?.output.kind))
+    let kind = Description::parse(published(name)?)?.output.kind;
+    Part::of(kind).ok_or_else(|| {
+        Error::input(format!("{name} finds {}, which no prior is made of", kind.name()))
+            .remedy("Give it to `splat4d import --keypoints` (docs/networks.md)")
+    })
 }

@@ -1,7 +1,8 @@
 //! Findings of pairs of cameras: poses, exposure, white balance and sharpness, by features that two of them see.
 
-use super::finding::{AGREE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
+use super::finding::{AGREE, EXPOSURE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
 use super::look::{CameraObservations, Viewpoint, detail};
+use super::vignetting::{self, Sighting};
 use super::{Options, PairReport, Report};
 use crate::sfm::pictures::{CameraView, Feature};
 use crate::sfm::tracks::{Pairing, links};
@@ -21,8 +22,6 @@ use splat4d_train::vision::raster::grey;
 pub(super) const EPIPOLAR: [f64; 2] = [1.0, 2.0];
 /// And at least this many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
 pub(super) const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
-/// Exposure, and one channel against green, stops.
-pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];
 /// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose
 /// axes are farther apart most, degrees.
 const SURE: usize = 20;
@@ -30,6 +29,9 @@ const APART: f64 = 60.0;
 const TELL: usize = 3;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
+/// Medians of the distance from the epipolar line within which a match is one, and pixels that lines are off at least.
+const LINE: f64 = 4.0;
+const EXACT: f64 = 0.1;
 /// Differences of pairs, in stops and as a logarithm of sharpness, that are off by more contradict the others.
 const STOPS: f64 = 0.1;
 const TIMES: f64 = 0.15;
@@ -98,9 +100,12 @@ struct Pair {
     gain: [f64; 3],
     /// Logarithm of how much sharper it is.
     sharper: f64,
+    /// Brightness of single features.
+    sightings: Vec<Sighting>,
 }
 
 fn pair(
+    capture: &Capture,
     viewpoints: &[(usize, &Viewpoint)],
     sights: &[CameraView],
     [a, b]: [usize; 2],
@@ -111,13 +116,24 @@ fn pair(
     let (p, q) = (viewpoints[a].1, viewpoints[b].1);
     let f = fundamental(&p.view, &q.view);
     let (mut off, mut gains, mut sharper) = (Vec::new(), [Vec::new(), Vec::new(), Vec::new()], Vec::new());
+    let mut sightings = Vec::new();
     for ([i, j], _) in matches {
         let (x, y) = (sights[a].features[*i].pixel, sights[b].features[*j].pixel);
-        off.push(sampson(&f, x, y).abs());
+        let distance = sampson(&f, x, y).abs();
+        off.push(distance);
         let (Some(one), Some(two)) = (around(p, x), around(q, y)) else { continue };
         let exposed = |v: f64| (EXPOSED[0]..EXPOSED[1]).contains(&v);
-        for c in (0..3).filter(|&c| exposed(one.0[c]) && exposed(two.0[c])) {
-            gains[c].push(GAMMA * (two.0[c] / one.0[c]).log2());
+        let ratio = |c: usize| {
+            let good = exposed(one.0[c]) && exposed(two.0[c]);
+            good.then(|| GAMMA * (two.0[c] / one.0[c]).log2())
+        };
+        let stops = [0, 1, 2].map(ratio);
+        (0..3).for_each(|c| gains[c].extend(stops[c]));
+        if let ([Some(red), Some(green), Some(blue)], Some(first), Some(second)) =
+            (stops, vignetting::radius(capture, p, x), vignetting::radius(capture, q, y))
+        {
+            let sighting = Sighting { viewpoints: [a, b], radii: [first, second], stops: (red + green + blue) / 3.0 };
+            sightings.push((distance, sighting));
         }
         sharper.push((two.1.max(1e-9) / one.1.max(1e-9)).ln());
     }
@@ -128,7 +144,10 @@ fn pair(
     // Chance matches only add large distances: the lower quartile, as the median that it implies of normal errors.
     off.sort_by(f64::total_cmp);
     let own = QUARTILE_TO_MEDIAN * off[off.len() / 4];
+    // Chance matches are of other points.
+    sightings.retain(|(distance, _)| *distance <= LINE * own.max(EXACT));
     Some(Pair {
+        sightings: sightings.into_iter().map(|(_, sighting)| sighting).collect(),
         viewpoints: [a, b],
         matches: off.len(),
         off: [own * 0.5 * (unit(&p.view) + unit(&q.view)), own],
@@ -193,7 +212,8 @@ pub(super) fn between(
     let sights: Vec<CameraView> =
         viewpoints.par_iter().enumerate().map(|(k, (c, s))| sight(name(*c), k, s, options.features)).collect();
     let found = links(&sights, Pairing::All, 0, progress);
-    let pairs: Vec<Pair> = found.iter().filter_map(|l| pair(&viewpoints, &sights, l.sights, &l.matches)).collect();
+    let mut pairs: Vec<Pair> =
+        found.iter().filter_map(|l| pair(capture, &viewpoints, &sights, l.sights, &l.matches)).collect();
     if pairs.is_empty() {
         report
             .left
@@ -209,6 +229,8 @@ pub(super) fn between(
     };
     report.pairs = pairs.iter().map(told).collect();
     report.pairs.sort_by(|a, b| b.epipolar.total_cmp(&a.epipolar));
+    let sightings: Vec<Sighting> = pairs.iter_mut().flat_map(|p| std::mem::take(&mut p.sightings)).collect();
+    vignetting::vignetting(capture, &viewpoints, &sightings, report);
     let rig = seen.iter().filter(|s| !s.viewpoints.is_empty()).count();
     let by_camera = |value: &dyn Fn(&Pair) -> f64, scale: f64| {
         let of = |p: &Pair| (p.viewpoints.map(|k| viewpoints[k].0), value(p), p.matches as f64);

@@ -5,6 +5,8 @@ use splat4d::scene::Camera;
 
 /// Sharpness relative to other cameras.
 pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
+/// Exposure, one channel against green, and corners against the middle of images, stops.
+pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];
 /// sRGB values are this power of light, about.
 pub(super) const GAMMA: f64 = 2.2;
 /// Matches that are needed to judge a pair.

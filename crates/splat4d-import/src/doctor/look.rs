@@ -27,6 +27,8 @@ const MOVING: f64 = 0.25;
 
 /// An image from a position: of the static background, or one of a moving camera.
 pub(super) struct Viewpoint {
+    /// Its number in the capture; the first of those that a median is of.
+    pub(super) frame: usize,
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
 }
@@ -228,10 +230,10 @@ pub(super) fn camera(
             let still = Grey::of(&picture);
             seen.motion = pictures.iter().map(|p| cells(&Grey::of(p), &still)).collect();
         }
-        seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[chosen[0]].view), picture });
+        seen.viewpoints.push(Viewpoint { frame: chosen[0], view: reduced(&capture.frames[chosen[0]].view), picture });
     } else {
         for (&i, picture) in chosen.iter().zip(pictures) {
-            seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[i].view), picture });
+            seen.viewpoints.push(Viewpoint { frame: i, view: reduced(&capture.frames[i].view), picture });
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;

@@ -12,6 +12,7 @@ mod look;
 mod shutter;
 #[cfg(test)]
 mod tests;
+mod vignetting;
 mod volume;
 
 use crate::{Error, Result};
@@ -78,6 +79,8 @@ pub struct CameraReport {
     pub focus: Option<f64>,
     /// Seconds from the first to the last row of an image, and their standard deviation.
     pub shutter: Option<[f64; 2]>,
+    /// Share of light that the corners of its images lose, and its standard deviation.
+    pub vignetting: Option<[f64; 2]>,
     /// Its image.
     #[serde(skip)]
     pub picture: Rgb8,
@@ -91,7 +94,7 @@ impl CameraReport {
         let or_pixels = |limits, pixels: [f64; 2]| finding::worse(limits, pixels.map(|p| p * finding::unit(view)));
         Some(match field {
             "epipolar" => or_pixels(between::EPIPOLAR, between::OWN_PIXELS),
-            "exposure" => between::EXPOSURE,
+            "exposure" => finding::EXPOSURE,
             "sharpness" | "focus" => finding::SHARPNESS,
             "moved" => or_pixels(alone::MOVED, alone::MOVED_PIXELS),
             "shutter" => clocks::SHUTTER,

@@ -171,6 +171,40 @@ fn exposure_and_colour_are_found() {
     is_found(&with(|_, p| times(p, [1.0, 1.0, 0.8])), "white-balance");
 }
 
+/// All images as a lens darkens them.
+fn darkened(clip: &Clip, k: [f64; 2]) -> Clip {
+    let mut clip = clip.clone();
+    for p in clip.iter_mut().flatten() {
+        let (width, height) = (p.width as f64, p.height as f64);
+        for (i, v) in p.data.iter_mut().enumerate() {
+            let (x, y) = ((i / 3 % p.width) as f64 + 0.5 - 0.5 * width, (i / 3 / p.width) as f64 + 0.5 - 0.5 * height);
+            let r2 = 4.0 * (x * x + y * y) / (width * width + height * height);
+            let light = 1.0 + k[0] * r2 + k[1] * r2 * r2;
+            *v = (f64::from(*v) * light.powf(1.0 / 2.2)).round() as u8;
+        }
+    }
+    clip
+}
+
+#[test]
+fn vignetting_is_found_and_its_remedy_states_it() {
+    let report = report_of(&darkened(clean(), [-0.3, -0.1]), 0.0, CAMERAS);
+    let finding = report.findings.iter().find(|f| f.check == "vignetting").expect("it is strong");
+    let loss = finding.amount.unwrap();
+    assert!((loss - 40.0).abs() < 2.0 && finding.camera.is_none() && finding.what.starts_with("All 6"), "{finding:?}");
+    let list = finding.remedy.split(['[', ']']).nth(1).unwrap();
+    let stated: Vec<f64> = list.split(", ").map(|k| k.parse().unwrap()).collect();
+    assert!(stated.len() == 3 && (stated.iter().sum::<f64>() + 0.01 * loss).abs() < 0.01, "{list}");
+    // Just below the threshold of 10 %, as corners of a clean capture: no finding.
+    for k in [[-0.05, -0.01], [0.0; 2]] {
+        let report = report_of(&darkened(clean(), k), 0.0, CAMERAS);
+        let [loss, sigma] = report.cameras[0].vignetting.unwrap();
+        // The drawn room itself is off by nearly 3 %, beyond the deviation.
+        assert!((loss + k[0] + k[1]).abs() < 0.035 && sigma < 0.01, "{loss} {sigma}");
+        assert!(found(&report, "vignetting").is_empty(), "{:?}", report.findings);
+    }
+}
+
 #[test]
 fn flicker_is_found() {
     is_found(&with(|n, p| times(p, [if n % 2 == 0 { 1.0 } else { 0.9 }; 3])), "flicker");
@@ -336,7 +370,7 @@ fn seen_ball(view: Camera, place: [f64; 3]) -> CameraObservations {
         }
     }
     CameraObservations {
-        viewpoints: vec![Viewpoint { view, picture: Rgb8::default() }],
+        viewpoints: vec![Viewpoint { frame: 0, view, picture: Rgb8::default() }],
         motion: vec![cells; 2],
         ..CameraObservations::default()
     }
@@ -402,7 +436,7 @@ fn timed(late: f64, shutter: f64) -> Report {
     let seen = |c: usize| {
         let own = |value: f64| if c == ILL { value } else { 0.0 };
         CameraObservations {
-            viewpoints: vec![Viewpoint { view: camera(c), picture: Rgb8::default() }],
+            viewpoints: vec![Viewpoint { frame: 0, view: camera(c), picture: Rgb8::default() }],
             tracks: tracks(c, own(late), own(shutter)),
             clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
             row: 60,

@@ -24,6 +24,7 @@ mod world;
 
 pub use assist::Desk;
 pub(crate) use inputs::{Input, find};
+pub use people::{Detector, Keypoints};
 pub use report::{CameraReport, Report};
 pub use spacing::Gap;
 
@@ -32,7 +33,7 @@ use crate::calibration::Video;
 use crate::clicks::Clicks;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
-use crate::sfm::learned::Learned;
+use crate::sfm::learned::{Learned, Matcher};
 use crate::sync::graph::{self, Evidence};
 use crate::video::{self, Cropping, Selection, Source};
 use crate::write::{self, Clip, Format, Pictures, Recording};
@@ -90,10 +91,10 @@ pub struct Request {
     pub synchronous: bool,
     /// Points that the user clicked (`Desk`), which give poses, focal lengths and time offsets.
     pub points: Option<PathBuf>,
-    /// A folder with keypoints of people in all frames, which give the same without clicks.
-    pub keypoints: Option<PathBuf>,
+    /// Keypoints of people, which give the same without clicks.
+    pub keypoints: Option<Keypoints>,
     /// Matches pairs of cameras, or of frames of a moving one, whose features do not match.
-    pub matcher: Option<Arc<Learned>>,
+    pub matcher: Option<Arc<dyn Matcher>>,
 }
 
 /// Pixels of the shorter side that images get: training on a CPU resolves no more.
@@ -173,8 +174,16 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
-    let placed = match (&request.keypoints, &clicks) {
-        (Some(folder), _) => Some(people::placed(folder, &cameras, &pictures, &mut known, &clock, &kept, &mut report)?),
+    let people = match &request.keypoints {
+        Some(Keypoints::Given(folder)) => Some(people::given(folder, &cameras, &pictures)?),
+        Some(Keypoints::By(detector)) => {
+            let images = stored::Stored::new(folder, &pictures, &[], &[]);
+            Some(people::detected(&**detector, &images, &cache, progress, stop)?)
+        }
+        None => None,
+    };
+    let placed = match (people, &clicks) {
+        (Some(people), _) => Some(people::placed(people, &pictures, &mut known, &clock, &kept, &mut report)?),
         (None, Some(clicks)) => Some(assist::placed(clicks, &pictures, &mut known, &clock, &kept, &mut report)?),
         (None, None) => None,
     };
@@ -183,7 +192,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         clock = clocks::solve(&cameras, &heard, &told);
         clicked = Some(placed.origin);
     }
-    let stored = stored::Stored::new(folder, &pictures, &known, &masks).matched_by(request.matcher.as_deref());
+    let learned = request.matcher.clone().map(Learned::new);
+    let stored = stored::Stored::new(folder, &pictures, &known, &masks).matched_by(learned.as_ref());
     let mut evidence = heard;
     let mut moves = None;
     if pictures.len() > 1 && !moving && clock.offsets.iter().any(Option::is_none) {

@@ -159,6 +159,9 @@ impl Pictures for Blank {
 }
 
 impl Matcher for Oracle {
+    fn identity(&self) -> &str {
+        "an oracle"
+    }
     fn matches(&self, images: [&Rgb8; 2]) -> Result<Matches> {
         let [a, b] = images.map(|i| &self.rig.sights[usize::from(i.data[0]) / GREYS].features);
         // Of 800 points 240 are static, each of a colour of its own.
@@ -180,7 +183,7 @@ fn a_matcher_relates_images_without_features() {
         solve(&Blank { learned }, &Options::default(), &mut Progress(&mut silent), &|| stop)
     };
     let truth = || rig(5, 800, 0.3, 0.0, 0.0);
-    let learned = |wrong: f64| Some(Learned::new("an oracle".into(), Box::new(Oracle { rig: truth(), wrong })));
+    let learned = |wrong: f64| Some(Learned::new(std::sync::Arc::new(Oracle { rig: truth(), wrong })));
     assert!(solved(None, false).unwrap_err().to_string().contains("--matcher"));
     assert_eq!(solved(learned(0.0), true).unwrap_err().kind(), ErrorKind::Interrupted);
     for wrong in [0.0, 0.3] {

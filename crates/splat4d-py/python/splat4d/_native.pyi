@@ -377,6 +377,7 @@ def import_videos(
     calibration: _Path | None = None,
     colmap: bool = False,
     points: _Path | None = None,
+    keypoints: _Path | None = None,
     matcher: _Path | None = None,
     described: str | None = None,
     masks: _Path | None = None,

@@ -75,7 +75,8 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
         .zip(turned)
         .map(|((raw, flow), upright)| {
             let shutter = options.shutter(raw.shutter);
-            Frame { flow, upright, shutter, ..finish(raw, options.downscale) }
+            let vignetting = raw.vignetting.or(options.vignetting).filter(|k| *k != [0.0; 3]);
+            Frame { flow, upright, shutter, vignetting, ..finish(raw, options.downscale) }
         })
         .collect();
     shutter::find_motion(&mut frames, &cameras);
@@ -213,7 +214,8 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         tracks: raw.tracks,
         recorded: None,
         shutter: None,
-        vignetting: raw.vignetting,
+        vignetting: None,
+        residual: [0.0; 2],
     }
 }
 

@@ -100,7 +100,7 @@ pub(crate) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<
             .at(file.path.display())
             .remedy("Write it in the image's shape (it may be smaller or larger as a whole)"));
     }
-    let mut full = straighten(&map, source);
+    let mut full = straighten(&map, source, &frame.distortion());
     if let Some(fit) = &file.fit {
         fit.remove_errors(&mut full, source.width, source.height);
     }
@@ -233,8 +233,8 @@ fn check(map: &Map, file: &DepthFile) -> Result<()> {
 /// At the size of the image's pinhole view, each pixel as the nearest one of the map: means across an edge are
 /// of neither side.
 /// Undistortion keeps rays, and so z.
-fn straighten(map: &Map, camera: &Camera) -> Vec<f32> {
-    let (lens, k) = (Distortion::new(camera.lens), &camera.intrinsics);
+fn straighten(map: &Map, camera: &Camera, lens: &Distortion) -> Vec<f32> {
+    let k = &camera.intrinsics;
     if lens.is_pinhole() && (map.width, map.height) == (camera.width, camera.height) {
         return map.values.clone();
     }

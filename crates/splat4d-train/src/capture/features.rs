@@ -4,7 +4,6 @@
 //! A pixel whose channels are all 0 is unknown.
 
 use super::json;
-use super::lens::Distortion;
 use super::{Capture, Frame, picture};
 use splat4d::format::npy::Npy;
 use splat4d::scene::features::MOST_CHANNELS;
@@ -53,7 +52,7 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Features>>
         return Err(place(Error::input(what).remedy("Write 0 in all channels where nothing is known")));
     }
     // Each pixel of the view takes the nearest one of the array: means across an edge belong to no surface.
-    let (lens, k, down) = (Distortion::new(source.lens), &source.intrinsics, capture.downscale);
+    let (lens, k, down) = (frame.distortion(), &source.intrinsics, capture.downscale);
     let (to_width, to_height) = (source.width / down, source.height / down);
     let scale = [width as f64 / source.width as f64, height as f64 / source.height as f64];
     let mut out = vec![0.0; channels * to_width * to_height];

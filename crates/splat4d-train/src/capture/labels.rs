@@ -25,7 +25,7 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> 
         e.at(format!("camera {camera}, frame {}", frame.index))
     };
     let (source, k) = (&frame.source, capture.downscale);
-    let full = straighten(decode(path, source, capture.labels.len()).map_err(place)?, source);
+    let full = straighten(decode(path, source, capture.labels.len()).map_err(place)?, source, &frame.distortion());
     let (width, height) = (source.width / k, source.height / k);
     let pixel = |p: usize| {
         let first = (p / width * k) * source.width + p % width * k;
@@ -70,8 +70,7 @@ fn decode(path: &Path, camera: &Camera, count: usize) -> Result<Vec<u8>> {
 }
 
 /// From the distorted image to the pinhole view: the label of the nearest pixel.
-fn straighten(labels: Vec<u8>, camera: &Camera) -> Vec<u8> {
-    let lens = Distortion::new(camera.lens);
+fn straighten(labels: Vec<u8>, camera: &Camera, lens: &Distortion) -> Vec<u8> {
     if lens.is_pinhole() {
         return labels;
     }

@@ -25,6 +25,8 @@ pub struct Distortion {
     lens: Lens,
     /// Largest x/z-radius or angle in radians (fisheyes) that is still imaged.
     limit: f64,
+    /// A lens before it, k1 and k2 of r² and r⁴, and the radius up to which it does not fold; `None`: there is none.
+    before: Option<([f64; 2], f64)>,
 }
 
 impl Distortion {
@@ -41,16 +43,31 @@ impl Distortion {
             }
             _ => f64::INFINITY,
         };
-        Self { lens, limit }
+        Self { lens, limit, before: None }
+    }
+
+    /// A lens that images rays which another one of two coefficients has bent: (x, y) (1 + k1 r² + k2 r⁴).
+    pub(crate) fn after(lens: Lens, [k1, k2]: [f64; 2]) -> Self {
+        let slope = |r: f64| 1.0 + r * r * (3.0 * k1 + 5.0 * k2 * r * r);
+        let before = ([k1, k2] != [0.0; 2]).then(|| ([k1, k2], first_fold(MAX_RADIUS, slope)));
+        Self { before, ..Self::new(lens) }
     }
 
     /// Whether this lens bends nothing.
     pub(crate) fn is_pinhole(&self) -> bool {
-        matches!(self.lens, Lens::Pinhole)
+        matches!(self.lens, Lens::Pinhole) && self.before.is_none()
     }
 
     /// Projection of the ray (x, y, 1) to the normalised sensor; `None` beyond the fold.
-    pub fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+    pub fn distort(&self, ray: [f64; 2]) -> Option<[f64; 2]> {
+        let Some(([k1, k2], limit)) = self.before else { return self.stated(ray) };
+        let r2 = ray[0] * ray[0] + ray[1] * ray[1];
+        let bent = ray.map(|v| v * (1.0 + r2 * (k1 + r2 * k2)));
+        (r2 <= limit * limit).then(|| self.stated(bent)).flatten()
+    }
+
+    /// The same of the lens itself.
+    fn stated(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let r = x.hypot(y);
         match self.lens {
             Lens::Brown { k, p, s } => {
@@ -87,6 +104,17 @@ impl Distortion {
     /// The ray (x, y, 1) that lands on a point of the normalised sensor; `None` where no ray before the fold does (for
     /// fisheyes also where the ray is 90° or more off the axis).
     pub fn undistort(&self, target: [f64; 2]) -> Option<[f64; 2]> {
+        let ray = self.straightened(target)?;
+        let Some(([k1, k2], limit)) = self.before else { return Some(ray) };
+        let radius = |r: f64| {
+            let r2 = r * r;
+            (r * (1.0 + r2 * (k1 + r2 * k2)), 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2))
+        };
+        Some(along(ray, invert(limit, length(ray), radius)?))
+    }
+
+    /// The same of the lens itself.
+    fn straightened(&self, target: [f64; 2]) -> Option<[f64; 2]> {
         match self.lens {
             Lens::Brown { k, p, s } => {
                 // The radial part alone is solved safely first; the tangential rest is small, so that Newton converges.
@@ -317,6 +345,22 @@ fn radial(lens: &Lens, r: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_lens_before_a_pinhole_is_browns_and_is_inverted_before_another() {
+        let brown = |k1, k2| Lens::Brown { k: [k1, k2, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] };
+        let (plain, both) =
+            (Distortion::after(Lens::Pinhole, [-0.1, 0.03]), Distortion::after(brown(0.2, -0.05), [-0.1, 0.03]));
+        assert!(!plain.is_pinhole() && Distortion::after(Lens::Pinhole, [0.0; 2]).is_pinhole());
+        for ray in [[0.0, 0.0], [0.3, -0.2], [-0.6, 0.5]] {
+            let known = Distortion::new(brown(-0.1, 0.03)).distort(ray).unwrap();
+            let got = plain.distort(ray).unwrap();
+            assert!((0..2).all(|k| (got[k] - known[k]).abs() < 1e-15), "{got:?} {known:?}");
+            let back = both.undistort(both.distort(ray).unwrap()).unwrap();
+            assert!((0..2).all(|k| (back[k] - ray[k]).abs() < 1e-9), "{back:?} {ray:?}");
+        }
+        assert_eq!(Distortion::after(Lens::Pinhole, [-0.4, 0.0]).distort([1.0, 0.0]), None, "it folds before");
+    }
 
     /// Pixels of five rays by pycolmap 4.2.1 (`Camera.img_from_cam`), f = (300, 310), c = (320, 240).
     const RAYS: [[f64; 2]; 5] = [[0.1, -0.2], [0.7, 0.3], [-1.1, 0.9], [0.0, 1.6], [-2.5, -1.2]];

@@ -78,6 +78,7 @@ pub use sequence::Timing;
 pub use shutter::Shutter;
 pub use store::{ImageStore, Picture, StoredPicture};
 pub use tracks::Tracks;
+pub(crate) use vignetting::parsed as parsed_vignetting;
 
 use account::Account;
 use splat4d::Result;
@@ -179,6 +180,16 @@ pub struct Frame {
     pub shutter: Option<Shutter>,
     /// Coefficients of the vignetting that is removed from its image; `None`: there is none.
     pub vignetting: Option<[f64; 3]>,
+    /// Distortion that remains after the stated one, as training has learnt it: a ray (x, y, 1) of the view is the ray
+    /// (x, y) (1 + k1 r² + k2 r⁴) of the stated lens. Images and masks are undistorted with both.
+    pub residual: [f64; 2],
+}
+
+impl Frame {
+    /// The lens of its image file, with what remains.
+    fn distortion(&self) -> Distortion {
+        Distortion::after(self.source.lens, self.residual)
+    }
 }
 
 /// One camera of the rig, or one moving camera.

@@ -2,6 +2,7 @@
 
 use super::convention::Poses;
 use super::shutter::{self, Shutter};
+use super::vignetting;
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
 use std::collections::BTreeMap;
@@ -202,6 +203,9 @@ settings! {
         subframes: usize = 1 => at_least(1);
         /// Exposure time of cameras that state none.
         exposure_time: f64 = 0.0 => any().unit("seconds");
+        /// Vignetting of cameras that state none, `k1,k2,k3` of light = 1 + k1 r² + k2 r⁴ + k3 r⁶, r = 1 in the corners:
+        /// it is removed from images; empty: none.
+        vignetting: Text = Text::default();
     }
 }
 
@@ -255,6 +259,8 @@ pub struct CaptureOptions {
     pub exposure: f64,
     /// Renders that are averaged over an exposure; 1: motion blur is not modelled.
     pub subframes: usize,
+    /// Vignetting of cameras that state none; `None`: there is none.
+    pub vignetting: Option<[f64; 3]>,
 }
 
 /// Share of the images that may be missing by default: a few were deleted; more is probably another folder.
@@ -301,6 +307,7 @@ impl Default for CaptureOptions {
             readout: Some(0.0),
             exposure: 0.0,
             subframes: 1,
+            vignetting: None,
         }
     }
 }
@@ -334,6 +341,7 @@ impl CaptureOptions {
         }
         shutter::checked("readout", self.readout.unwrap_or(0.0))?;
         shutter::checked("exposure_time", self.exposure)?;
+        vignetting::checked(self.vignetting.unwrap_or_default())?;
         if self.background.is_some_and(|b| b.iter().any(|v| !(0.0..=1.0).contains(v))) {
             return Err(Error::input("the background is outside [0,1]").remedy("Give three numbers from 0 to 1."));
         }

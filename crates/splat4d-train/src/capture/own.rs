@@ -322,7 +322,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
     };
     let offset = node.opt("time_offset")?.map_or(Ok(0.0), |n| n.number())?;
     let shutter = [read_shutter(node, "readout")?, read_shutter(node, "exposure_time")?];
-    let vignetting = node.opt("vignetting")?.map(|n| read_vignetting(&n)).transpose()?.flatten();
+    let vignetting = node.opt("vignetting")?.map(|n| read_vignetting(&n)).transpose()?;
     let times = node.opt("times")?.map(|n| read_times(&n)).transpose()?;
     let start = context.shared(node, "start")?.unwrap_or(0);
     let count = context.shared(node, "frames")?;
@@ -497,7 +497,7 @@ fn read_shutter(node: &Node<'_>, key: &str) -> Result<Option<f64>> {
 }
 
 /// A camera's vignetting: up to three coefficients.
-fn read_vignetting(node: &Node<'_>) -> Result<Option<[f64; 3]>> {
+fn read_vignetting(node: &Node<'_>) -> Result<[f64; 3]> {
     let values = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
     let mut k = [0.0; 3];
     if values.len() > k.len() {

@@ -398,7 +398,7 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let depth = frame.depth.as_ref();
     let depth = depth.map(|d| Ok((depth::read(d, frame, capture.downscale)?, d.kind))).transpose().map_err(place)?;
     let flow = frame.flow.as_ref().map(|f| flow::read(f, frame, capture)).transpose().map_err(place)?;
-    let lens = Distortion::new(frame.source.lens);
+    let lens = frame.distortion();
     let opaque = raster.alpha().is_none_or(|a| (0..raster.width * raster.height).all(|p| raster.get(p, a) >= 1.0));
     let unchanged = opaque && lens.is_pinhole() && frame.vignetting.is_none();
     if let (true, 1, Samples::Eight(samples)) = (unchanged, capture.downscale, &raster.samples) {

@@ -14,9 +14,8 @@ const LIGHT: [f64; 2] = [0.1, 2.0];
 /// Radii at which coefficients are checked.
 const CHECKED: usize = 64;
 
-/// Coefficients as a file states them; `None`: there is no vignetting. Errors: a corner that is nearly black, or far brighter
-/// than the middle.
-pub(super) fn checked(k: [f64; 3]) -> Result<Option<[f64; 3]>> {
+/// Coefficients as a file or a setting states them. Errors: a corner that is nearly black, or far brighter than the middle.
+pub(super) fn checked(k: [f64; 3]) -> Result<[f64; 3]> {
     let radii = (0..=CHECKED).map(|n| (n as f64 / CHECKED as f64).powi(2));
     if let Some(light) = radii.map(|r2| light(&k, r2)).find(|light| !(LIGHT[0]..=LIGHT[1]).contains(light)) {
         let what = format!("invalid vignetting {k:?}: somewhere light would be {light:.2} of that in the middle");
@@ -24,7 +23,27 @@ pub(super) fn checked(k: [f64; 3]) -> Result<Option<[f64; 3]>> {
             "Give k1, k2, k3 of light = 1 + k1 r² + k2 r⁴ + k3 r⁶, r = 1 in the corners (lensfun's model \"pa\")",
         ));
     }
-    Ok((k != [0.0; 3]).then_some(k))
+    Ok(k)
+}
+
+/// Coefficients of a setting, `k1,k2,k3`; `None`: it is empty. Errors: no numbers, more than three, and those of [`checked`].
+pub(crate) fn parsed(text: &str) -> Result<Option<[f64; 3]>> {
+    let mut k = [0.0; 3];
+    let numbers: Vec<&str> = text.split(',').map(str::trim).collect();
+    if text.trim().is_empty() {
+        return Ok(None);
+    }
+    let bad = || {
+        Error::input(format!("invalid capture.vignetting \"{text}\""))
+            .remedy("Give up to three numbers, such as -0.31,0.08,-0.02")
+    };
+    if numbers.len() > k.len() {
+        return Err(bad());
+    }
+    for (k, number) in k.iter_mut().zip(&numbers) {
+        *k = number.parse().map_err(|_| bad())?;
+    }
+    checked(k).map(Some)
 }
 
 /// Light at a squared radius, 1 in the middle.
@@ -56,7 +75,7 @@ mod tests {
 
     #[test]
     fn what_a_lens_darkened_is_as_before() {
-        let lens = checked([-0.5, 0.2, -0.1]).unwrap().unwrap();
+        let lens = parsed("-0.5, 0.2,-0.1").unwrap().unwrap();
         let (width, height) = (40, 30);
         let code = |p: usize| 0.2 + 0.6 * (p % 7) as f64 / 7.0;
         let darkened = |p: usize| {
@@ -76,7 +95,11 @@ mod tests {
 
     #[test]
     fn impossible_coefficients_are_refused() {
-        assert_eq!(checked([0.0; 3]).unwrap(), None);
+        assert_eq!(parsed(" ").unwrap(), None);
+        assert_eq!(parsed("-0.3").unwrap(), Some([-0.3, 0.0, 0.0]));
+        for text in ["-0.1,0.2,0.1,0", "dark", "-0.1,", "-4"] {
+            assert!(parsed(text).unwrap_err().to_string().contains("invalid"), "{text}");
+        }
         for k in [[-0.95, 0.0, 0.0], [3.0, 0.0, 0.0], [f64::NAN, 0.0, 0.0], [-4.0, 4.0, 0.0]] {
             assert!(checked(k).unwrap_err().to_string().contains("invalid vignetting"), "{k:?}");
         }

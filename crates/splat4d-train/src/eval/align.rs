@@ -37,7 +37,7 @@ impl Align {
         let learnt = learnable(recipe);
         let wanted = (learnt.poses || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();
         // The whole run is of use here: the scene has formed, and does not settle.
-        let settings = RefineSettings { poses_from: 0.0, times_from: 0.0, until: 1.0, ..learnt };
+        let settings = RefineSettings { lens: false, poses_from: 0.0, times_from: 0.0, until: 1.0, ..learnt };
         wanted.then(|| Self { settings, scale: scale(&plan(capture, recipe)) })
     }
 
@@ -54,8 +54,7 @@ impl Align {
     ) -> Result<(Capture, Value)> {
         let info = |f: usize| &capture.frames[f];
         let fixed = |f: usize| capture.cameras[info(f).camera].fixed;
-        let origins: Vec<Origin<'_>> =
-            frames.iter().map(|&f| Origin { rig: info(f).camera, fixed: fixed(f), camera: &info(f).view }).collect();
+        let origins: Vec<Origin<'_>> = frames.iter().map(|&f| Origin::of(info(f), fixed(f))).collect();
         let mut found = Corrections::new(&self.settings, self.scale, &origins, capture.cameras.len(), false);
         if self.settings.times {
             let look = Dataset::new(store.clone(), frames.to_vec());

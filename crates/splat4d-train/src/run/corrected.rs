@@ -3,7 +3,7 @@
 use super::checkpoint::write_atomically;
 use crate::capture::{Capture, Frame};
 use crate::step::trainer::Trainer;
-use crate::train_state::{EXPOSURE_COLUMNS as COLUMNS, TrainState, moved, zoomed};
+use crate::train_state::{EXPOSURE_COLUMNS as COLUMNS, Origin, TrainState, moved, zoomed};
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use splat4d::scene::Time;
@@ -26,7 +26,7 @@ pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Res
     };
     let mut value = match corrections {
         Some(corrections) => corrections.report(&name),
-        None => json!({ "poses": false, "focal": false, "times": false, "cameras": [] }),
+        None => json!({ "poses": false, "focal": false, "lens": false, "times": false, "cameras": [] }),
     };
     if let Some(exposure) = photos {
         let row = |&rig: &usize| (capture.cameras[rig].name.clone(), json!(exposure.response(rig, Time(0.0))));
@@ -115,6 +115,8 @@ struct Correction<'a> {
     seconds: f64,
     /// Share by which the focal length is longer.
     zoom: f64,
+    /// Distortion that remains.
+    lens: [f64; 2],
 }
 
 fn correction(row: &Value) -> Option<Correction<'_>> {
@@ -126,18 +128,39 @@ fn correction(row: &Value) -> Option<Correction<'_>> {
         seconds: row["offset"].as_f64()?,
         // Runs of older versions have none.
         zoom: row.get("focal").map_or(Some(0.0), Value::as_f64)?,
+        lens: match row.get("lens") {
+            None => [0.0; 2],
+            Some(lens) => [lens[0].as_f64()?, lens[1].as_f64()?],
+        },
     })
 }
 
 /// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out
-/// images
-/// of the same cameras as far as they share them.
+/// images of the same cameras as far as they share them. Cameras that state the same lens as a training camera have
+/// its distortion.
 ///
 /// Errors: those of [`read`].
 pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
     let Some(value) = read(run)? else { return Ok(()) };
     let rows: Vec<_> = value["cameras"].as_array().into_iter().flatten().filter_map(correction).collect();
-    for frame in &mut capture.frames {
+    let mut lenses: Vec<(usize, [f64; 2])> = Vec::new();
+    for (i, frame) in capture.frames.iter().enumerate() {
+        let row = rows.iter().find(|row| row.camera == capture.cameras[frame.camera].name);
+        let known = |&(other, _): &(usize, _)| Origin::of(frame, true).alike(&Origin::of(&capture.frames[other], true));
+        if let Some(row) = row.filter(|row| row.lens != [0.0; 2] && !lenses.iter().any(known)) {
+            lenses.push((i, row.lens));
+        }
+    }
+    let residuals: Vec<[f64; 2]> = (capture.frames.iter())
+        .map(|frame| {
+            let of = |(other, _): &&(usize, [f64; 2])| {
+                Origin::of(frame, true).alike(&Origin::of(&capture.frames[*other], true))
+            };
+            lenses.iter().find(of).map_or([0.0; 2], |(_, lens)| *lens)
+        })
+        .collect();
+    for (frame, residual) in capture.frames.iter_mut().zip(residuals) {
+        frame.residual = residual;
         let camera = &capture.cameras[frame.camera].name;
         let mut of_camera = rows.iter().filter(|row| row.camera == camera);
         if let Some(row) = of_camera.clone().find(|row| row.picture.is_none_or(|index| index == frame.index as u64)) {
@@ -154,6 +177,40 @@ pub fn apply(capture: &mut Capture, run: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::run::open::OpenCapture;
+    use crate::run::plan;
+    use crate::run::tests::{Place, recipe};
+    use splat4d::scene::Lens;
+    use std::sync::Arc;
+
+    /// The lens of the training cameras is that of a held-out one that states the same, and not of one that states another.
+    #[test]
+    fn a_learnt_lens_is_that_of_all_cameras_that_state_it() {
+        let place = Place::new();
+        let recipe = recipe(&["hold_out=camera=1", "max_frames=1", "refine.lens=true"]);
+        let mut capture = Capture::clone(&place.open(&recipe));
+        let opened = OpenCapture::new(Arc::new(capture.clone()), &recipe).unwrap();
+        let scene = opened.initial_scene(&recipe, &plan(&capture, &recipe)).unwrap();
+        let mut trainer = opened.trainer(&recipe, &plan(&capture, &recipe), scene).unwrap();
+        trainer.train_state.corrections.as_mut().unwrap().set_lens(0, [0.02, -0.01]);
+        let folder = place.run("lens");
+        std::fs::create_dir_all(&folder).unwrap();
+        write(&folder, &trainer, &capture).unwrap();
+        let held = capture.held[0];
+        let r2 = crate::train_state::corner(&capture.frames[0].view);
+        for other in [false, true] {
+            if other {
+                capture.frames[held].source.lens =
+                    Lens::Brown { k: [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 4] };
+            }
+            apply(&mut capture, &folder).unwrap();
+            for (i, frame) in capture.frames.iter().enumerate() {
+                let [a, b] = if other && i == held { [0.0; 2] } else { [0.02 / r2, -0.01 / (r2 * r2)] };
+                let [k1, k2] = frame.residual;
+                assert!((k1 - a).abs() < 1e-6 && (k2 - b).abs() < 1e-6, "frame {i}: {:?}", frame.residual);
+            }
+        }
+    }
 
     /// Twelve photos in a row, of which the exposure changes slowly: the third and the last were held out.
     #[test]

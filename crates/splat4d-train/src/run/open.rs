@@ -3,7 +3,7 @@
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
-use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, Lenses, frames};
+use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, Lenses, frames, parsed_vignetting};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::loss::image::terms;
@@ -47,6 +47,7 @@ pub(crate) fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
         readout: recipe.capture.rolling_shutter.then_some(recipe.capture.readout),
         exposure: recipe.capture.exposure_time,
         subframes: recipe.capture.subframes,
+        vignetting: parsed_vignetting(&recipe.capture.vignetting.0)?,
         ..CaptureOptions::default()
     })
 }
@@ -281,12 +282,12 @@ impl OpenCapture {
     /// Corrections of cameras to learn, if enabled in the recipe.
     fn corrections(&self, recipe: &Recipe, plan: &TrainContext) -> Option<Corrections> {
         let settings = learnable(recipe);
-        if !settings.poses && !settings.focal && !settings.times {
+        if !settings.any() {
             return None;
         }
         let origin = |&i: &usize| {
             let frame = &self.capture.frames[i];
-            Origin { rig: frame.camera, fixed: self.capture.cameras[frame.camera].fixed, camera: &frame.view }
+            Origin::of(frame, self.capture.cameras[frame.camera].fixed)
         };
         let frames: Vec<Origin<'_>> = self.capture.train.iter().map(origin).collect();
         Some(Corrections::new(&settings, scale(plan), &frames, self.capture.cameras.len(), true))

@@ -255,7 +255,7 @@ fn recipes() -> Vec<Recipe> {
         recipe(&["strategy=adc", "densify_grad_threshold=1e-5", "opacity_reset_interval=8", "batch_size=2"]),
         recipe(&["motion_order=2", "rotation_rate=true", "life=interval", "lambda_velocity=0.1", "strategy=none"]),
         recipe(&["motion=still", "sh_degree=2", "sh_degree_interval=7"]),
-        recipe(&["refine.poses=true", "refine.focal=true", "refine.times=true", "batch_size=2"]),
+        recipe(&["refine.poses=true", "refine.focal=true", "refine.lens=true", "refine.times=true", "batch_size=2"]),
         recipe(&["motion=tracked", "track_feature_lr=0.002", "exposure=true", "exposure_lr=0.01"]),
         recipe(&[&STG[..], &["strategy=adc", "densify_grad_threshold=1e-5"]].concat()),
     ]

@@ -4,6 +4,7 @@
 //! distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
+use super::lens::{Bend, Bent};
 use super::shutter::{self, Average, Exposed, Share, Taken};
 use crate::Result;
 use crate::loss::image::{Channel, LossGrads, Shown};
@@ -46,6 +47,8 @@ pub struct StepReport {
     pub d_cameras: Vec<[f64; 6]>,
     /// dL/d logarithm of every view's focal lengths.
     pub d_focals: Vec<f64>,
+    /// dL/d coefficients of every view's lens; 0 without one.
+    pub d_lenses: Vec<[f64; 2]>,
     /// Times of the parts.
     pub timings: Timings,
 }
@@ -53,7 +56,12 @@ pub struct StepReport {
 impl StepReport {
     /// The gradients to what cameras learn.
     pub(crate) fn grads(&self) -> StepGrads<'_> {
-        StepGrads { d_cameras: &self.d_cameras, d_focals: &self.d_focals, d_times: &self.d_times }
+        StepGrads {
+            d_cameras: &self.d_cameras,
+            d_focals: &self.d_focals,
+            d_lenses: &self.d_lenses,
+            d_times: &self.d_times,
+        }
     }
 }
 
@@ -86,6 +94,7 @@ pub(crate) struct Chain<F: Real = f32> {
     evaluation: Evaluation<F>,
     picture: Compared<F>,
     exposed: Exposed<F>,
+    bent: Bent<F>,
     /// Number of `Motion::at` calls of the last step, for tests and reports.
     pub at_calls: usize,
 }
@@ -191,7 +200,7 @@ impl<F: Real> Chain<F> {
         let source = Source { scene, view, asked: &asked };
         let needs = work.image.needs(view);
         let channels = Channels::new(&needs.extra, source, &self.evaluation);
-        let (taken, layers) = (Taken::of(view), scene.layers.len());
+        let (taken, layers, bend) = (Taken::of(view), scene.layers.len(), Bend::of(view.camera));
         let n = view.shutter.map_or(1, |shutter| shutter.subframes);
         let look =
             Look { view, sh_degree: step.sh_degree, depth: needs.depth, extra: channels.as_ref().map(|c| &c.table) };
@@ -201,7 +210,10 @@ impl<F: Real> Chain<F> {
             if let Some(taken) = taken {
                 self.exposed.expose(&self.evaluation, layers, taken, k);
             }
-            let splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            let mut splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            if let Some(bend) = &bend {
+                self.bent.bend(&mut splats, bend);
+            }
             let shot = look.shot(&splats);
             compared = match &target {
                 Some(target) => self.picture.compare_there(view, &shot, target, work)?,
@@ -216,14 +228,17 @@ impl<F: Real> Chain<F> {
             self.picture.compare(step.info, view, channels.as_ref().map_or(&[], |c| &c.places), work);
             work.report.timings.loss += lap(&mut clock);
         }
-        let (mut camera, mut focal) = ([0.0; 6], 0.0);
+        let (mut camera, mut focal, mut lens) = ([0.0; 6], 0.0, [0.0; 2]);
         for k in (0..n).rev() {
             // The backend still has the last subframe.
             let again = k + 1 < n;
             if let Some(taken) = taken.filter(|_| again) {
                 self.exposed.expose(&self.evaluation, layers, taken, k);
             }
-            let splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            let mut splats = self.exposed.shown(&self.evaluation, scene, view.t, taken.is_some());
+            if let Some(bend) = &bend {
+                self.bent.bend(&mut splats, bend);
+            }
             let shot = look.shot(&splats);
             if again {
                 work.backend.render(&shot, &mut self.picture.part)?;
@@ -233,6 +248,10 @@ impl<F: Real> Chain<F> {
             }
             work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
             drop(splats);
+            if let Some(bend) = &bend {
+                let d_k = self.bent.backward(&mut self.picture.d_splats, bend);
+                (0..2).for_each(|i| lens[i] += d_k[i]);
+            }
             (0..6).for_each(|i| camera[i] += self.picture.d_splats.camera[i]);
             focal += self.picture.d_splats.focal;
             if n > 1 {
@@ -254,6 +273,7 @@ impl<F: Real> Chain<F> {
         }
         work.report.d_cameras.push(camera);
         work.report.d_focals.push(focal);
+        work.report.d_lenses.push(lens);
         work.report.timings.render_backward += lap(&mut clock);
         Ok(())
     }

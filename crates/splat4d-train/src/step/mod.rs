@@ -6,6 +6,7 @@ mod channels;
 pub(crate) mod clocks;
 pub(crate) mod emphasis;
 pub mod engine;
+pub(crate) mod lens;
 pub mod loss;
 pub(crate) mod pace;
 pub mod replans;

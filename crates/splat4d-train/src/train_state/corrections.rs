@@ -1,20 +1,21 @@
-//! `Corrections`: learnt corrections of camera poses, focal lengths and time offsets.
+//! `Corrections`: learnt corrections of camera poses, focal lengths, lenses and time offsets.
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
-//! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
-//! of all times of a camera. Images do not determine the absolute position, scale and start time of the scene, so the
+//! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a lens is the shares
+//! by which r² and r⁴ move its image corners outwards. A correction of a clock is a shift of all times of a camera. Images do not determine the absolute position, scale and start time of the scene, so the
 //! cameras' mean motion, mean scale and median time offset are fixed. The median is used because a single wrong offset
 //! must not shift the correct ones.
 
+use crate::capture::Frame;
 use crate::optim::step_row;
 use crate::settings::settings;
 use serde_json::{Value, json};
 use splat4d::math::Se3;
 use splat4d::math::se3::{cross, dot, mat_vec, norm, sub, transpose};
-use splat4d::scene::{Camera, Intrinsics, Table, Time};
+use splat4d::scene::{Camera, Intrinsics, Lens, Table, Time};
 
 settings! {
-    /// Refinement of cameras during training: poses, focal lengths and time offsets.
+    /// Refinement of cameras during training: poses, focal lengths, lenses and time offsets.
     pub struct RefineSettings {
         /// Learn a correction of every training camera's pose, one for all frames of a fixed camera. The cameras' mean
         /// motion and scale stay fixed. Held-out views are also measured aligned.
@@ -24,6 +25,9 @@ settings! {
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
         /// Learn a correction of every training camera's focal length, with a prior to the stated one.
         focal: bool = false;
+        /// Learn the radial distortion (k1, k2) that remains of every lens: training cameras whose files state the same
+        /// size, focal lengths and distortion have one lens.
+        lens: bool = false;
         /// Rate of rotations at the start; 50 views per camera suffice for half a degree. Three times as much is as
         /// exact (studies/records/2026-11-26-refine.md).
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
@@ -40,20 +44,32 @@ settings! {
         focal_init: f64 = 1e-3 => positive().when(On("refine.focal"));
         /// Rate of focal lengths at the end.
         focal_final: f64 = 1e-5 => positive().when(On("refine.focal"));
+        /// Rate of distortion at the start, share by which corners of the image move. Our choice, half of the focal
+        /// lengths': a lens has the images of several cameras.
+        lens_init: f64 = 5e-4 => positive().when(On("refine.lens"));
+        /// Rate of distortion at the end.
+        lens_final: f64 = 1e-5 => positive().when(On("refine.lens"));
         /// Rate of time offsets at the start, after the last search.
         time_init: f64 = 0.05 => positive().unit("frames").when(On("refine.times"));
         /// Rate of time offsets at the end.
         time_final: f64 = 1e-3 => positive().unit("frames").when(On("refine.times"));
         /// Largest time offset, and range of the first searches.
         time_limit: f64 = 4.0 => positive().unit("frames").when(On("refine.times"));
-        /// Share of the run after which poses and focal lengths are learned.
-        poses_from: f64 = 0.1 => share().when(Any(&[On("refine.poses"), On("refine.focal")]));
+        /// Share of the run after which poses, focal lengths and lenses are learned.
+        poses_from: f64 = 0.1 => share().when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.lens")]));
         /// Share of the run after which time offsets are searched; the searches are spread up to half of the run.
         times_from: f64 = 0.1 => share().when(On("refine.times"));
         /// Share of the run after which cameras are fixed, so that the scene converges.
-        until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
+        until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.lens"), On("refine.times")]));
         /// Steps to align every held-out camera before its second measurement.
         align_steps: usize = 100 => any().unit("iterations").when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
+    }
+}
+
+impl RefineSettings {
+    /// Whether anything is learnt of cameras.
+    pub(crate) fn any(&self) -> bool {
+        self.poses || self.focal || self.lens || self.times
     }
 }
 
@@ -63,11 +79,13 @@ const TERMS: usize = 16;
 /// are hardly different each has its own.
 const APART: f64 = 1e-6;
 
-/// Share by which a correction of a focal length falls back in every step: changes without support in the images decay.
+/// Share by which a correction of a focal length or a lens falls back in every step: changes without support in the images decay.
 /// Our choice, not swept.
 const PULL: f64 = 1e-4;
 /// Largest correction of a focal length, a share of it.
 const FOCAL_LIMIT: f64 = 0.2;
+/// Largest correction of a lens, the same.
+const LENS_LIMIT: f64 = 0.2;
 /// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to continue. Not swept.
 const SEARCHED: f64 = 0.5;
 /// Searches over the whole range of time offsets, in frames; later ones search locally in halves.
@@ -75,8 +93,12 @@ const WIDE_SEARCHES: usize = 3;
 /// Reach and distance of shifts of the later searches, frames.
 const NARROW: [f64; 2] = [1.5, 0.5];
 
+/// Names of the tables in a checkpoint.
+const TABLES: [&str; 4] = ["refine.poses", "refine.focal", "refine.lens", "refine.times"];
 /// Columns of a table of numbers with their moments.
 const POSE: usize = 6;
+/// And coefficients of a lens.
+const LENS: usize = 2;
 
 /// Data of a corrected frame.
 #[derive(Clone, Copy, Debug)]
@@ -87,6 +109,21 @@ pub(crate) struct Origin<'a> {
     pub fixed: bool,
     /// As in the capture.
     pub camera: &'a Camera,
+    /// Its image file's lens.
+    pub lens: Lens,
+}
+
+impl<'a> Origin<'a> {
+    /// Of a capture's frame; `fixed`: its camera has one pose.
+    pub(crate) fn of(frame: &'a Frame, fixed: bool) -> Self {
+        Self { rig: frame.camera, fixed, camera: &frame.view, lens: frame.source.lens }
+    }
+
+    /// Whether two images are of one lens, as far as is stated.
+    pub(crate) fn alike(&self, other: &Self) -> bool {
+        let of = |o: &Self| (o.camera.width, o.camera.height, o.camera.intrinsics.fx, o.camera.intrinsics.fy, o.lens);
+        of(self) == of(other)
+    }
 }
 
 /// The scale of a capture, in which rates are stated.
@@ -105,6 +142,8 @@ pub(crate) struct StepGrads<'a> {
     pub d_cameras: &'a [[f64; 6]],
     /// To logarithms of focal lengths.
     pub d_focals: &'a [f64],
+    /// To coefficients of lenses.
+    pub d_lenses: &'a [[f64; LENS]],
     /// To times.
     pub d_times: &'a [f64],
 }
@@ -116,6 +155,8 @@ pub(crate) struct Gradients {
     pub poses: Vec<(usize, [f64; POSE])>,
     /// To shares of focal lengths, by camera.
     pub focal: Vec<(usize, [f64; 1])>,
+    /// To shares of corners, by lens.
+    pub lens: Vec<(usize, [f64; LENS])>,
     /// To shifts of clocks, by camera.
     pub times: Vec<(usize, [f64; 1])>,
 }
@@ -139,13 +180,17 @@ pub struct Corrections {
     rows: Vec<usize>,
     /// By frame: its camera.
     rigs: Vec<usize>,
+    /// By frame: its lens, and the squared radius of its image corners.
+    lenses: Vec<(usize, f64)>,
     /// By row: the capture's pose, and a frame with it.
     origins: Vec<(Se3, usize)>,
     /// Values 6, moments 12, steps 1; by row.
     poses: Option<Table<f32>>,
     /// Values 1, moments 2, steps 1; by camera.
     focal: Option<Table<f32>>,
-    /// The same.
+    /// Values 2, moments 4, steps 1; by lens.
+    lens: Option<Table<f32>>,
+    /// As of focal lengths.
     times: Option<Table<f32>>,
     /// Whether the mean of all stays nothing: not where the scene is frozen.
     gauge: bool,
@@ -169,6 +214,15 @@ impl Corrections {
             }));
             of_rig[frame.rig] = Some(rows[i]);
         }
+        let mut known: Vec<usize> = Vec::new();
+        let mut lenses = Vec::new();
+        for (i, frame) in frames.iter().enumerate() {
+            let lens = known.iter().position(|&other| frame.alike(&frames[other])).unwrap_or_else(|| {
+                known.push(i);
+                known.len() - 1
+            });
+            lenses.push((lens, corner(frame.camera)));
+        }
         let table = |width, rows| Table::new(&[("values", width), ("moments", 2 * width), ("steps", 1)], rows);
         let first = frames.first().map(|f| f.rig);
         // A single camera is its own mean.
@@ -179,6 +233,8 @@ impl Corrections {
             scale,
             poses: poses.then(|| table(POSE, origins.len())),
             focal: settings.focal.then(|| table(1, cameras)),
+            lens: settings.lens.then(|| table(LENS, known.len())),
+            lenses,
             times: times.then(|| table(1, cameras)),
             rigs: frames.iter().map(|f| f.rig).collect(),
             rows,
@@ -189,23 +245,33 @@ impl Corrections {
 
     /// All that a checkpoint holds of it.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, &Table<f32>)> {
-        [("refine.poses", &self.poses), ("refine.focal", &self.focal), ("refine.times", &self.times)]
-            .into_iter()
-            .filter_map(|(name, table)| Some((name, table.as_ref()?)))
+        let all = [&self.poses, &self.focal, &self.lens, &self.times];
+        TABLES.into_iter().zip(all).filter_map(|(name, table)| Some((name, table.as_ref()?)))
     }
 
     /// The same, to read it.
     pub(crate) fn tables_mut(&mut self) -> impl Iterator<Item = (&'static str, &mut Table<f32>)> {
-        [("refine.poses", &mut self.poses), ("refine.focal", &mut self.focal), ("refine.times", &mut self.times)]
-            .into_iter()
-            .filter_map(|(name, table)| Some((name, table.as_mut()?)))
+        let all = [&mut self.poses, &mut self.focal, &mut self.lens, &mut self.times];
+        TABLES.into_iter().zip(all).filter_map(|(name, table)| Some((name, table.as_mut()?)))
     }
 
-    /// The camera of frame `i`, corrected.
+    /// The camera of frame `i`, corrected. Its lens is what remains after images were undistorted.
     pub(crate) fn camera(&self, i: usize, stated: &Camera) -> Camera {
         let moved = self.twist(self.rows[i]).map(|twist| exp(twist).after(&stated.cam_from_world));
         let zoomed = zoomed(&stated.intrinsics, self.zoom(self.rigs[i]));
-        Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), intrinsics: zoomed, ..stated.clone() }
+        let lens = self.coefficients(i).map_or(stated.lens, |[k1, k2]| Lens::Brown {
+            k: [k1, k2, 0.0, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+            s: [0.0; 4],
+        });
+        Camera { cam_from_world: moved.unwrap_or(stated.cam_from_world), intrinsics: zoomed, lens, ..stated.clone() }
+    }
+
+    /// k1 and k2 of the lens of frame `i`, of what remains; `None`: lenses are not learnt.
+    fn coefficients(&self, i: usize) -> Option<[f64; LENS]> {
+        let (lens, r2) = self.lenses[i];
+        let [a, b] = self.lens.as_ref()?.read::<LENS>(lens, 0).map(f64::from);
+        Some([a / r2, b / (r2 * r2)])
     }
 
     /// The share by which the focal lengths of a camera are longer than stated.
@@ -237,6 +303,10 @@ impl Corrections {
             // To the share, of that to the logarithm.
             add(&mut out.focal, self.rigs[i], [d / (1.0 + self.zoom(self.rigs[i]))]);
         }
+        for (&i, d) in frames.iter().zip(report.d_lenses).filter(|_| self.lens.is_some()) {
+            let (lens, r2) = self.lenses[i];
+            add(&mut out.lens, lens, [d[0] / r2, d[1] / (r2 * r2)]);
+        }
         for (&i, &d) in frames.iter().zip(report.d_times) {
             add(&mut out.times, self.rigs[i], [d]);
         }
@@ -252,7 +322,7 @@ impl Corrections {
             (0.0..1.0).contains(&done).then_some(done)
         };
         let rate = |ends: [f64; 2], done: f64, unit: f64| scale * unit * ends[0] * (ends[1] / ends[0]).powf(done);
-        let Gradients { poses: d_poses, focal: d_focal, times: d_times } = self.gradients(frames, report);
+        let Gradients { poses: d_poses, focal: d_focal, lens: d_lens, times: d_times } = self.gradients(frames, report);
         if let (Some(done), Some(poses)) = (share(s.poses_from), &mut self.poses) {
             let place = rate([s.position_init, s.position_final], done, self.scale.extent);
             let turn = rate([s.rotation_init, s.rotation_final], done, 1.0);
@@ -269,6 +339,14 @@ impl Corrections {
                 step_row(focal, rig, d, [step]);
                 let kept = f64::from(focal.get(rig, 0)) * (1.0 - PULL);
                 focal.set(rig, 0, kept.clamp(-FOCAL_LIMIT, FOCAL_LIMIT) as f32);
+            }
+        }
+        if let (Some(done), Some(lenses)) = (share(s.poses_from), &mut self.lens) {
+            let step = rate([s.lens_init, s.lens_final], done, 1.0);
+            for (lens, d) in d_lens {
+                step_row(lenses, lens, d, [step; LENS]);
+                let kept = lenses.read::<LENS>(lens, 0).map(|x| f64::from(x) * (1.0 - PULL));
+                lenses.write(lens, 0, kept.map(|x| x.clamp(-LENS_LIMIT, LENS_LIMIT) as f32));
             }
         }
         if let (Some(done), Some(times)) = (share(self.searched()), &mut self.times) {
@@ -371,11 +449,11 @@ impl Corrections {
             json!({
                 "camera": camera, "frame": index, "twist": twist, "offset": offset, "degrees": r.to_degrees(),
                 "share": p / self.scale.extent, "frames": offset / self.scale.frame,
-                "focal": self.zoom(self.rigs[*frame]),
+                "focal": self.zoom(self.rigs[*frame]), "lens": self.coefficients(*frame).unwrap_or_default(),
             })
         };
         json!({
-            "poses": self.poses.is_some(), "focal": self.focal.is_some(), "times": self.times.is_some(),
+            "poses": self.poses.is_some(), "focal": self.focal.is_some(), "lens": self.lens.is_some(), "times": self.times.is_some(),
             "cameras": self.origins.iter().enumerate().map(row).collect::<Vec<_>>(),
         })
     }
@@ -384,6 +462,12 @@ impl Corrections {
     #[cfg(test)]
     pub(crate) fn set_zoom(&mut self, rig: usize, share: f32) {
         self.focal.as_mut().expect("focal lengths are learnt").set(rig, 0, share);
+    }
+
+    /// Sets the shares by which a lens moves its corners.
+    #[cfg(test)]
+    pub(crate) fn set_lens(&mut self, lens: usize, shares: [f32; LENS]) {
+        self.lens.as_mut().expect("lenses are learnt").write(lens, 0, shares);
     }
 
     /// Sets values, to make some up.
@@ -401,6 +485,13 @@ impl Corrections {
 /// Intrinsics of which both focal lengths are longer by a share of them.
 pub(crate) fn zoomed(stated: &Intrinsics, share: f64) -> Intrinsics {
     Intrinsics { fx: stated.fx * (1.0 + share), fy: stated.fy * (1.0 + share), ..*stated }
+}
+
+/// The squared radius of the image corner that is farthest from a camera's axis, of the ray (x, y, 1).
+pub(crate) fn corner(camera: &Camera) -> f64 {
+    let k = &camera.intrinsics;
+    let far = |size: usize, center: f64, focal: f64| (center.max(size as f64 - center) / focal).powi(2);
+    far(camera.width, k.cx, k.fx) + far(camera.height, k.cy, k.fy)
 }
 
 /// A pose moved by a twist (ρ, θ) from the left.

@@ -72,6 +72,9 @@ pub struct Input {
     /// Splits larger images into windows of `size` that overlap by this many pixels; without it images are resized.
     #[serde(default)]
     pub overlap: Option<usize>,
+    /// Grey, 0 to 255, right of and below images that keep their shape within `size`; without it they are stretched.
+    #[serde(default)]
+    pub pad: Option<u8>,
     /// Windows that run together.
     #[serde(default = "whole_one")]
     pub batch: usize,
@@ -86,7 +89,7 @@ pub struct Input {
 pub struct Output {
     /// Its kind.
     pub kind: Kind,
-    /// Names of its outputs; empty: the first one (of matches: the first three).
+    /// Names of its outputs; empty: the first one (of matches: the first three, or as `form` requires).
     #[serde(default)]
     pub names: Vec<String>,
     /// The number of the output that is used, from 0, where names are empty.
@@ -107,12 +110,33 @@ pub struct Output {
     /// Whether depth is metric.
     #[serde(default)]
     pub metric: bool,
-    /// Masks: values from here on count; matches: scores below do not.
+    /// Masks: values from here on count; matches and people: scores below do not.
     #[serde(default)]
     pub threshold: f32,
-    /// Matches: coordinates of the centre of the first pixel.
+    /// Matches and people: coordinates of the centre of the first pixel.
     #[serde(default)]
     pub pixel_centre: f32,
+    /// How matches are given.
+    #[serde(default)]
+    pub form: Form,
+    /// People: of two whose boxes share more than this part of their union, the one with the lower score is left out.
+    #[serde(default = "usual_overlap")]
+    pub overlap: f32,
+}
+
+/// How a network returns matches.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub enum Form {
+    /// Key points of both images [2, points, 2], matches [matches, 3] (pair, number in the first and second image), and
+    /// their scores [matches].
+    #[default]
+    Numbered,
+    /// Positions in the first image [matches, 2], those in the second [matches, 2], and scores [matches].
+    Pairs,
+    /// For each pixel of the first image its position in both, from -1 to 1 over the image [1, h, w, 4] (x, y, x, y), and
+    /// its score [1, h, w].
+    Warp,
 }
 
 /// Axes of an input.
@@ -162,9 +186,11 @@ pub enum Kind {
     Flow,
     /// Foreground, larger where it is.
     Mask,
-    /// Key points of both images [2, points, 2], matches [matches, 3] (pair, number in the first and second image),
-    /// and their scores [matches].
+    /// What two images share; see [`Form`].
     Matches,
+    /// Keypoints of the people in an image [people, keypoints, 3] (x, y, confidence), and their boxes and scores [people, 5]
+    /// (left, top, right, bottom, score) if a second output is named.
+    People,
 }
 
 impl Kind {
@@ -176,6 +202,7 @@ impl Kind {
             Kind::Flow => "flow",
             Kind::Mask => "mask",
             Kind::Matches => "matches",
+            Kind::People => "people",
         }
     }
 
@@ -199,6 +226,11 @@ fn ones() -> [f32; 3] {
 
 fn whole_one() -> usize {
     1
+}
+
+/// As RTMO's own program has it.
+fn usual_overlap() -> f32 {
+    0.45
 }
 
 impl Description {
@@ -253,13 +285,22 @@ impl Description {
             (Some(overlap), Some(size)) if 2 * overlap > size[0].min(size[1]) => {
                 return bad(format!("input.overlap of {overlap} pixels is more than half of a window"));
             }
-            (Some(_), _) if output.kind == Kind::Matches => {
-                return bad("input.overlap is not supported for matches: remove it".into());
+            (Some(_), _) if matches!(output.kind, Kind::Matches | Kind::People) => {
+                return bad(format!("input.overlap is not supported for {}: remove it", output.kind.name()));
             }
             _ => {}
         }
         if input.pair == Pair::Batch && !output.kind.of_pairs() {
             return bad(format!("input.pair is for flow and matches, not for {}", output.kind.name()));
+        }
+        if input.pad.is_some() && (!matches!(output.kind, Kind::Matches | Kind::People) || input.overlap.is_some()) {
+            return bad("input.pad is for matches and people, without input.overlap".into());
+        }
+        if output.form != Form::Numbered && output.kind != Kind::Matches {
+            return bad(format!("output.form is for matches, not for {}", output.kind.name()));
+        }
+        if !(0.0..=1.0).contains(&output.overlap) {
+            return bad(format!("expected output.overlap from 0 to 1, found {}", output.overlap));
         }
         if output.minus.is_some() && output.kind != Kind::Mask {
             return bad(format!("output.minus is for masks, not for {}", output.kind.name()));

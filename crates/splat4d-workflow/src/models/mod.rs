@@ -1,18 +1,20 @@
 //! Networks that users bring as `.onnx` files, each with a description (`model.toml`) of what it takes and returns.
 //!
 //! The program never downloads weights. A network runs on the CPU (`network.rs`); images are given to it in its own size,
-//! or in windows that overlap. Descriptions of published exports are part of the program.
+//! or in windows that overlap; matches and people are positions in whole images (`points.rs`). Descriptions of published exports are part of the program.
 
 mod describe;
 mod network;
 mod pixels;
+mod points;
 mod published;
 #[cfg(all(test, feature = "models"))]
 pub(crate) mod tests;
 mod tiles;
 
-pub use describe::{Description, Kind};
+pub use describe::{Description, Form, Kind};
 pub use pixels::Map;
+pub use points::{Matches, Person};
 pub use published::{PUBLISHED, published};
 
 use crate::files;
@@ -34,9 +36,6 @@ pub struct Model {
     size: Option<[usize; 2]>,
     identity: String,
 }
-
-/// Matches of two images: positions in the first and the second, pixels of the images (the first pixel's centre is 0.5).
-pub type Matches = Vec<[[f32; 2]; 2]>;
 
 impl Model {
     /// Loads a network and the description next to it; `described`: the name of a description that the program has instead.
@@ -63,7 +62,9 @@ impl Model {
         };
         let description = Description::parse(&text).map_err(|e| e.at(place.display()))?;
         let count = match description.output.kind {
+            Kind::Matches if description.output.form == Form::Warp => 2,
             Kind::Matches => 3,
+            Kind::People => description.output.names.len().clamp(1, 2),
             _ if description.output.names.is_empty() => description.output.number + 1,
             _ => 1,
         };
@@ -138,40 +139,6 @@ impl Model {
             }
             _ => whole(),
         }
-    }
-
-    /// Matches of two images. Errors: outputs of another shape than described.
-    pub fn matches(&self, [a, b]: [&Rgb8; 2]) -> Result<Matches> {
-        let size = self.input_size([a.width, a.height]);
-        let images = [a, b].map(|image| pixels::scaled(image, size));
-        let outputs = self.network.run(self.inputs(&[images.iter().map(|i| (&**i, [0, 0])).collect()], size)?)?;
-        let [points, pairs, scores] = &outputs[..] else { return Err(self.unlike("three outputs", "others")) };
-        let (&[2, count, 2], &[found, 3]) = (&points.shape[..], &pairs.shape[..]) else {
-            let shapes = format!("{:?} and {:?}", points.shape, pairs.shape);
-            return Err(self.unlike("key points [2, points, 2] and matches [matches, 3]", &shapes));
-        };
-        if scores.data.len() != found {
-            return Err(self.unlike(&format!("{found} scores"), &scores.data.len().to_string()));
-        }
-        let (output, factors) = (&self.description.output, [a, b].map(|i| [i.width, i.height]));
-        let place = |image: usize, point: usize| {
-            let at = 2 * (image * count + point);
-            [0, 1].map(|k| {
-                let factor = factors[image][k] as f32 / size[k] as f32;
-                (points.data[at + k] - output.pixel_centre + 0.5) * factor
-            })
-        };
-        let mut out = Matches::new();
-        for (row, score) in pairs.data.chunks_exact(3).zip(&scores.data) {
-            let inside = row[1..].iter().all(|v| (0.0..count as f32).contains(v));
-            if row[0] == 0.0 && inside && *score >= output.threshold {
-                let both = [place(0, row[1] as usize), place(1, row[2] as usize)];
-                if both.iter().flatten().all(|v| v.is_finite()) {
-                    out.push(both);
-                }
-            }
-        }
-        Ok(out)
     }
 
     /// Width and height of the input for an image.

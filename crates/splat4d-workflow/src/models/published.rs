@@ -5,12 +5,15 @@ use crate::files::either;
 use splat4d::{Error, Result};
 
 /// Names and texts of the descriptions.
-pub const PUBLISHED: [(&str, &str); 7] = [
+pub const PUBLISHED: [(&str, &str); 10] = [
     ("depth-anything-v2", include_str!("published/depth-anything-v2.toml")),
     ("depth-anything-v2-hf", include_str!("published/depth-anything-v2-hf.toml")),
     ("midas-v2", include_str!("published/midas-v2.toml")),
     ("raft", include_str!("published/raft.toml")),
     ("superpoint-lightglue", include_str!("published/superpoint-lightglue.toml")),
+    ("efficient-loftr", include_str!("published/efficient-loftr.toml")),
+    ("roma-v2", include_str!("published/roma-v2.toml")),
+    ("rtmo", include_str!("published/rtmo.toml")),
     ("pphumanseg", include_str!("published/pphumanseg.toml")),
     ("u2net-human-seg", include_str!("published/u2net-human-seg.toml")),
 ];

@@ -126,6 +126,13 @@ fn mistakes_in_descriptions_name_the_file_and_the_remedy() {
         (with("kind", "scale = -1\nkind"), "output.scale"),
         (with("kind", "scale = nan\nkind"), "not finite"),
         (with("inverse-depth", "matches"), "expected 3 outputs"),
+        (with("kind", "form = \"warp\"\nkind"), "output.form is for matches, not for inverse-depth"),
+        (with("kind", "overlap = 2\nkind"), "output.overlap from 0 to 1"),
+        (with("range = 255", "range = 255\npad = 114"), "input.pad is for matches and people"),
+        (
+            with("range = 255", "size = [8, 8]\noverlap = 2").replace("inverse-depth", "people"),
+            "not supported for people",
+        ),
     ] {
         let said = error(&network, &text);
         assert!(said.contains(words) && (said.contains("model.toml") || said.contains("net.onnx")), "{words}: {said}");
@@ -153,6 +160,41 @@ fn outputs_that_are_not_as_described_are_errors() {
     two.output("sum", &IMAGES);
     let text = ran(&two.file(), PLAIN);
     assert!(text.contains("1 inputs, found 2"), "{text}");
+}
+
+#[test]
+fn positions_of_another_shape_than_described_are_errors() {
+    let image = image(8, 6);
+    let of = |outputs: &[(&str, &[usize], usize)]| {
+        let mut graph = Graph::default();
+        graph.input("image", &IMAGES);
+        let zero = zero_of(&mut graph, &["image"]);
+        for (name, shape, numbers) in outputs {
+            constant(&mut graph, &zero, name, shape, &vec![0.5; *numbers]);
+        }
+        graph.file()
+    };
+    let text = "version = 1\n[input]\npair = \"batch\"\n[output]\nkind = \"matches\"\nform = ";
+    let matched = |network: &[u8], form: &str| {
+        let model = load(&written(network, &format!("{text}\"{form}\"\n"))).unwrap();
+        model.matches([&image, &image]).unwrap_err().to_string()
+    };
+    let said = matched(&of(&[("a", &[3, 2], 6), ("b", &[4, 2], 8), ("c", &[3], 3)]), "pairs");
+    assert!(said.contains("positions [matches, 2]") && said.contains("[4, 2]") && said.contains("net.onnx"), "{said}");
+    let said = matched(&of(&[("a", &[1, 2, 2, 4], 16), ("b", &[1, 2, 2], 4)]), "warp");
+    assert!(said.contains("a warp [1, h, w, 2]") && said.contains("[1, 2, 2, 4]"), "{said}");
+    let said = matched(&of(&[("a", &[1, 2, 2, 2], 8), ("b", &[1, 2, 3], 6)]), "warp");
+    assert!(said.contains("scores [1, 2, 2]"), "{said}");
+    let plain = "version = 1\n[output]\nkind = \"people\"\n[input]\n";
+    let found = |network: &[u8], text: &str| load(&written(network, text)).unwrap().people(&image);
+    let said = found(&of(&[("a", &[2, 17, 2], 68)]), plain).unwrap_err().to_string();
+    assert!(said.contains("keypoints [people, keypoints, 3]") && said.contains("[2, 17, 2]"), "{said}");
+    let boxes = plain.replace("kind", "names = [\"a\", \"b\"]\nkind");
+    let said = found(&of(&[("a", &[2, 4, 3], 24), ("b", &[2, 4], 8)]), &boxes).unwrap_err().to_string();
+    assert!(said.contains("boxes [2, 5]") && said.contains("[2, 4]"), "{said}");
+    // Without boxes the keypoints' own: two people in one place are one.
+    assert_eq!(found(&of(&[("a", &[2, 4, 3], 24)]), plain).unwrap().len(), 2, "boxes of no size share nothing");
+    assert_eq!(found(&of(&[("a", &[0, 4, 3], 0)]), plain).unwrap(), Vec::<Person>::new());
 }
 
 #[test]
@@ -187,6 +229,25 @@ fn cubic_interpolation_is_reported() {
     let folder = written(&graph.file(), PLAIN);
     assert!(load(&folder).unwrap().warning().is_some_and(|w| w.contains("cubically") && w.contains("net.onnx")));
     assert_eq!(load(&written(&of_channel(0, 1.0, &IMAGES), PLAIN)).unwrap().warning(), None);
+}
+
+/// Zero, which depends on inputs.
+fn zero_of(graph: &mut Graph, inputs: &[&str]) -> String {
+    let none = graph.floats(&[], &[0.0]);
+    let mut sum = none.clone();
+    for input in inputs {
+        let largest = graph.node("ReduceMax", &[input], &[Attribute::Int("keepdims", 0)]);
+        let zero = graph.node("Mul", &[&largest, &none], &[]);
+        sum = graph.node("Add", &[&sum, &zero], &[]);
+    }
+    sum
+}
+
+/// An output of given numbers.
+fn constant(graph: &mut Graph, zero: &str, name: &str, shape: &[usize], numbers: &[f32]) {
+    let numbers = graph.floats(shape, numbers);
+    graph.named("Add", &[&numbers, zero], name, &[]);
+    graph.output(name, &vec![None; shape.len()]);
 }
 
 /// A stand-in of a published export: its inputs and outputs, and arithmetic that can be checked.
@@ -227,6 +288,35 @@ fn stand_in(name: &str) -> Vec<u8> {
         "superpoint-lightglue" => {
             let points = [0.0, 0.0, 511.5, 255.5, 1.0, 2.0, 3.0, 4.0];
             return of_points(&points, &[0, 0, 1, 0, 1, 0, 0, 1, 1], &[0.9, 0.5, 0.1]);
+        }
+        "efficient-loftr" => {
+            graph.input("image0", &[Some(1), Some(1), Some(480), Some(640)]);
+            graph.input("image1", &[Some(1), Some(1), Some(480), Some(640)]);
+            let zero = zero_of(&mut graph, &["image0", "image1"]);
+            constant(&mut graph, &zero, "keypoints0", &[2, 2], &[9.5, 19.5, 0.0, 0.0]);
+            constant(&mut graph, &zero, "keypoints1", &[2, 2], &[39.5, 29.5, 1.0, 1.0]);
+            constant(&mut graph, &zero, "confidence", &[2], &[0.9, 0.1]);
+        }
+        "roma-v2" => {
+            for input in ["img_A", "img_B"] {
+                graph.input(input, &[None, Some(3), Some(96), Some(96)]);
+            }
+            let zero = zero_of(&mut graph, &["img_A", "img_B"]);
+            // Everything is at the middle of the second image; one pixel of the first is sure.
+            let mut sure = vec![0.0; 96 * 96];
+            sure[96 * 10 + 21] = 0.8;
+            constant(&mut graph, &zero, "warp_AB", &[1, 96, 96, 2], &[0.0; 2 * 96 * 96]);
+            constant(&mut graph, &zero, "overlap_AB", &[1, 96, 96, 1], &sure);
+        }
+        "rtmo" => {
+            graph.input("input", &[Some(1), Some(3), Some(640), Some(640)]);
+            let zero = zero_of(&mut graph, &["input"]);
+            let mut people = vec![[100.0, 50.0, 0.9]; 3 * 17];
+            people[17] = [639.0, 639.0, 0.8];
+            // Twice the same person, one of them less sure; a third without a score.
+            let boxes = [10.0, 10.0, 200.0, 300.0, 0.8, 12.0, 10.0, 202.0, 300.0, 0.9, 400.0, 10.0, 500.0, 90.0, 0.2];
+            constant(&mut graph, &zero, "dets", &[1, 3, 5], &boxes);
+            constant(&mut graph, &zero, "keypoints", &[1, 3, 17, 3], people.as_flattened());
         }
         other => panic!("{other} has no stand-in"),
     }
@@ -269,6 +359,22 @@ fn published_descriptions_fit_stand_ins_of_their_exports() {
             }
             "pphumanseg" => near(model.map(&[&grey(51)]).unwrap().values[3], 0.0),
             "u2net-human-seg" => near(model.map(&[&grey(51)]).unwrap().values[3], (0.2 - 0.485) / 0.229),
+            "efficient-loftr" => {
+                // 960x480 are stretched to 640x480; the second match is not sure.
+                let matches = model.matches([&grey(51), &grey(51)]).unwrap();
+                assert_eq!(matches, [[[15.0, 20.0], [60.0, 30.0]]]);
+            }
+            "roma-v2" => {
+                let matches = model.matches([&grey(51), &grey(51)]).unwrap();
+                assert_eq!(matches, [[[215.0, 52.5], [480.0, 240.0]]]);
+            }
+            "rtmo" => {
+                // 960x480 become 640x320 above 320 rows of grey, where no keypoint is seen.
+                let people = model.people(&grey(51)).unwrap();
+                assert_eq!((people.len(), people[0].len()), (1, 17), "of two boxes that overlap the surer one");
+                assert_eq!(people[0][0], [0.0; 3]);
+                people[0][1].iter().zip([150.75, 75.75, 0.9]).for_each(|(found, wanted)| near(*found, wanted));
+            }
             _ => {
                 let matches = model.matches([&grey(51), &grey(51)]).unwrap();
                 // 960x480 become 1024x512; the third score is too low.

@@ -237,7 +237,7 @@ fn flow_is_unknown_where_the_flow_back_disagrees() {
     // something else, so that columns 15 to 19 of this image are not seen there.
     let forth = map(&|_| 5.0);
     let back = map(&|x| if (20..25).contains(&x) { 1.0 } else { -5.0 });
-    let write::Encoded::File(png) = write::flow(&forth, &back) else { panic!("flow is finite") };
+    let Encoded::File(png) = write::flow(&forth, &back) else { panic!("flow is finite") };
     let decoded = image::load_from_memory(&png).unwrap().into_rgb16();
     for x in 0..WIDTH {
         let [u, _, known] = decoded.get_pixel(x as u32, 2).0;

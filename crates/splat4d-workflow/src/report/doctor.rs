@@ -125,6 +125,11 @@ fn page(report: &Report, capture: &Capture) -> String {
             camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)),
             limits("shutter", 1e3, view),
         );
+        row(
+            "light lost in corners",
+            camera.vignetting.map(|[v, s]| format!("{:.0} ± {:.0} %", 100.0 * v, 100.0 * s)),
+            String::new(),
+        );
         body.push_str("</table></div>\n");
     }
     body.push_str("</div>\n");

@@ -40,6 +40,18 @@ pub fn refined_in_words(refined: &Value) -> Option<String> {
             worst["camera"].as_str()?,
         ));
     }
+    if refined["lens"] == true {
+        let mut lenses: Vec<[f64; 2]> =
+            rows.iter().map(|row| [0, 1].map(|k| row["lens"][k].as_f64().unwrap_or(0.0))).collect();
+        lenses.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        lenses.dedup();
+        let text = |k: &[f64; 2]| format!("{:+.4}, {:+.4}", k[0], k[1]);
+        let (first, last) = (lenses.first()?, lenses.last()?);
+        words.push(match lenses.len() {
+            1 => format!("distortion k1, k2 changed by {}", text(first)),
+            n => format!("distortion k1, k2 of {n} lenses changed by {} to {}", text(first), text(last)),
+        });
+    }
     if refined["times"] == true {
         let by_time = sorted("offset");
         let worst = by_time.first()?;

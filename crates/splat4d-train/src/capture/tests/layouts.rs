@@ -422,6 +422,12 @@ fn stated_vignetting_is_removed_from_images() {
         brighter += usize::from(new > old + 0.01);
     }
     assert!(brighter > 10, "{brighter} of {width}x{height}");
+    // A setting applies to cameras that state none.
+    sample.edit("capture.json", |v| v["cameras"][1]["vignetting"] = json!([0.0]));
+    let all = |vignetting| open_with(&sample, CaptureOptions { vignetting, ..CaptureOptions::default() });
+    assert_eq!(load(all(Some([-0.2, 0.0, 0.0]))), after, "both cameras state theirs");
+    sample.edit("capture.json", |v| v["cameras"][0].as_object_mut().unwrap().retain(|key, _| key != "vignetting"));
+    assert_eq!(load(all(Some([-0.3, 0.1, 0.0]))), after);
     for wrong in [json!([-0.95]), json!([0.1, 0.1, 0.1, 0.1]), json!("strong")] {
         sample.edit("capture.json", |v| v["cameras"][0]["vignetting"] = wrong.clone());
         let refused = Capture::open(sample.root(), &CaptureOptions::default()).unwrap_err().to_string();

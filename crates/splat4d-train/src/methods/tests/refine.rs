@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
+use splat4d::scene::Lens;
 
 /// Half the step of the differences, a power of two: of numbers that are kept in f32 it makes exact neighbours.
 const NEAR: f32 = 1.0 / 65_536.0;
@@ -11,16 +12,23 @@ const MOMENTS: [f64; 2] = [0.03, 0.14];
 
 /// Corrections that are not nothing, as they are after some steps.
 fn some(stated: &[Shot]) -> Corrections {
-    let settings = RefineSettings { poses: true, focal: true, times: true, ..RefineSettings::default() };
-    let frames: Vec<Origin<'_>> =
-        stated.iter().enumerate().map(|(i, s)| Origin { rig: i % CAMERAS, fixed: true, camera: &s.camera }).collect();
+    let settings = RefineSettings { poses: true, focal: true, lens: true, times: true, ..RefineSettings::default() };
+    let frames: Vec<Origin<'_>> = stated
+        .iter()
+        .enumerate()
+        .map(|(i, s)| Origin { rig: i % CAMERAS, fixed: true, camera: &s.camera, lens: Lens::Pinhole })
+        .collect();
     let mut out = Corrections::new(&settings, Scale { extent: 4.0, frame: 0.1 }, &frames, CAMERAS, true);
     for rig in 0..CAMERAS {
         out.set(rig, twist(rig), 0.015_625 * (rig as f32 - 1.0));
         out.set_zoom(rig, zoom(rig));
     }
+    out.set_lens(0, SHARES);
     out
 }
+
+/// By which the corners of the one lens move: r², r⁴.
+const SHARES: [f32; 2] = [0.09375, -0.03125];
 
 fn twist(rig: usize) -> [f32; 6] {
     [0.25, -0.125, 0.1875, 0.0625, -0.09375, 0.125].map(|x| x * (rig as f32 - 0.5))
@@ -31,7 +39,7 @@ fn zoom(rig: usize) -> f32 {
 }
 
 #[test]
-fn poses_focal_lengths_and_clocks_of_cameras_have_the_gradient_of_the_loss() {
+fn poses_lenses_and_clocks_of_cameras_have_the_gradient_of_the_loss() {
     let mut params = cloud::<f64>(9, LifeKind::GaussHalf, 61);
     let motion = build_as(&Spec::Spacetime(SpacetimeSpec::default()), &mut params).unwrap();
     let velocities = params.find("velocities").unwrap();
@@ -75,6 +83,16 @@ fn poses_focal_lengths_and_clocks_of_cameras_have_the_gradient_of_the_loss() {
     }
     for (rig, [d]) in &found.focal {
         assert_close(*d, loss(&|c, by| c.set_zoom(*rig, zoom(*rig) + by)), &format!("camera {rig}: dL/d focal length"));
+        assert!(d.abs() > 1e-6);
+    }
+    assert_eq!(found.lens.len(), 1, "all cameras have one lens");
+    for (k, d) in found.lens[0].1.iter().enumerate() {
+        let moved = |by: f32| {
+            let mut x = SHARES;
+            x[k] += by;
+            x
+        };
+        assert_close(*d, loss(&|c, by| c.set_lens(0, moved(by))), &format!("dL/d coefficient {k} of the lens"));
         assert!(d.abs() > 1e-6);
     }
     for (rig, [d]) in &found.times {

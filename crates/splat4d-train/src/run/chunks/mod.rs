@@ -412,7 +412,7 @@ fn check(recipe: &Recipe) -> Result<()> {
     let learnt = learnable(recipe);
     let (what, remedy) = if recipe.spacetime.has_features() {
         ("a network that makes colours (features = full)", "Use --set features=none")
-    } else if learnt.poses || learnt.focal || learnt.times {
+    } else if learnt.any() {
         ("cameras that are refined", "Refine them on a part of the capture first (--set max_frames=60)")
     } else if recipe.capture.observe < 1.0 {
         ("an unobserved future (--observe)", "Leave --observe away")

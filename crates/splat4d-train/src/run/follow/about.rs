@@ -76,7 +76,7 @@ pub(super) fn read_plan(file: &Path) -> Result<Value> {
 /// Errors: settings that a followed capture cannot have.
 pub(super) fn check(recipe: &Recipe) -> Result<()> {
     recipe.check()?;
-    let refined = recipe.refine.poses || recipe.refine.focal || recipe.refine.times;
+    let refined = recipe.refine.any();
     let other = !recipe.run.motion.is_auto() && recipe.run.motion != still::NAME;
     let (what, remedy) = if other && recipe.run.motion != PLAYED {
         (format!("motion `{}`", recipe.run.motion), "Leave option `motion` out: Gaussians move from frame to frame.")

@@ -14,7 +14,7 @@ use splat4d::device;
 use splat4d::math::align::Trajectory;
 use splat4d::math::{Rng, Se3};
 use splat4d::render::RenderConfig;
-use splat4d::scene::{Camera, Time};
+use splat4d::scene::{Camera, Lens, Time};
 use std::sync::Arc;
 
 const CAMERAS: usize = 7;
@@ -132,8 +132,9 @@ fn run(frames: Disturbed, line: &str) -> Left {
     let draw = device::cpu(RenderConfig::default());
     let stages = stages(program.as_ref(), &plan);
     let mut trainer = Trainer::new(scene, stages, frames.clone(), draw, TrainLoss::photometric(0.2), settings);
-    let origins: Vec<Origin<'_>> =
-        (0..frames.len()).map(|i| Origin { rig: frames.rig(i), fixed: true, camera: frames.camera(i) }).collect();
+    let origins: Vec<Origin<'_>> = (0..frames.len())
+        .map(|i| Origin { rig: frames.rig(i), fixed: true, camera: frames.camera(i), lens: Lens::Pinhole })
+        .collect();
     let scale = Scale { extent: EXTENT, frame: FRAME };
     trainer.train_state.corrections = Some(Corrections::new(&recipe.refine, scale, &origins, CAMERAS, true));
     while !trainer.is_done() {
