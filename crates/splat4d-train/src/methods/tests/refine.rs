@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
+use splat4d::scene::Lens;
 
 /// Half the step of the differences, a power of two: of numbers that are kept in f32 it makes exact neighbours.
 const NEAR: f32 = 1.0 / 65_536.0;
