@@ -20,7 +20,7 @@
 //! | `generated.rs` | rigs that a network generated (4DAnyone): poses and a video per view |
 //! | `predicted.rs` | poses, depth and images that a network predicted, in one `.npz` (VGGT, Depth Anything 3) |
 //! | `recording/` | the whole import: inputs, synchronisation, given calibrations, COLMAP, poses and time offsets in turn, unit and axes, delay of sound, cache, report |
-//! | `doctor/` | problems of a capture: one camera (`look.rs`, `alone.rs`), pairs of cameras (`between.rs`), time offsets and rolling shutters, the dynamic volume, the list of findings (`check.rs`) |
+//! | `doctor/` | problems of a capture: one camera (`look.rs`, `alone.rs`), pairs of cameras (`between.rs`), time offsets and rolling shutters, vignetting, the dynamic volume, the list of findings (`check.rs`) |
 
 pub mod board;
 pub mod calibration;

@@ -39,13 +39,13 @@
 //! | `optim/` | Adam, sparse over the active set, sixteen rows at a time; position noise of MCMC |
 //! | `loss/` | L1 + D-SSIM in one fused pass, contracts of losses (`terms.rs`), and every regulariser once, for any model: rigidity, rotation, isometry, ARAP, elastic, velocity, jerk, planes, tracking |
 //! | `loss/image/`, `loss/transport/` | image losses as a list of `ImageTerm`s; transport losses with and without a filter |
-//! | `train_state.rs`, `train_state/` | `TrainState`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, time offsets), which change together or not at all |
+//! | `train_state.rs`, `train_state/` | `TrainState`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, lenses, time offsets), which change together or not at all |
 //! | `maintenance/` | maintenance between steps, one operation per file: ADC with splits in time, MCMC, relocation, guided sampling, pruning, merging, nodes, opacity reset, Morton order, the split into static and dynamic layers |
 //! | `maintenance/importance/` | importance of every Gaussian in space and time, key masks |
 //! | `methods/`, `methods/control/` | how each motion model is learned: a `Method` with its `Stage`s; settings of all models (`common.rs`); the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
 //! | `init/` | first Gaussians: points, depth maps and their velocities, points added along surfaces (`fill.rs`), visual hulls, random points in the common volume; the far shell (`shell.rs`) |
 //! | `init/sky/` | cells of images that show far surroundings |
-//! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, rolling shutter and motion blur (`shutter.rs`), pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
+//! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, rolling shutter and motion blur (`shutter.rs`), lenses that are learnt (`lens.rs`), pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
 //! | `recipe.rs`, `recipe/` | all settings of a run, and the programs and plans built from them (`parts.rs`); TOML, `--set`, old names without tables |
 //! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
 //! | `blended.rs` | values of Gaussians as images blend them |

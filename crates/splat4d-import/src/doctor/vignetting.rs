@@ -130,9 +130,9 @@ fn falloffs(sightings: &[Sighting], lenses: &[usize]) -> Vec<Option<Falloff>> {
                 let column = factor.solve(corner);
                 let pull = |s: &Sighting| weight(s) * rest(s) * row(s).iter().map(|(k, v)| v * column[*k]).sum::<f64>();
                 let clusters = sightings.chunk_by(|a, b| a.viewpoints == b.viewpoints);
-                let told: f64 = clusters.map(|cluster| cluster.iter().map(pull).sum::<f64>().powi(2)).sum();
+                let pulled: f64 = clusters.map(|cluster| cluster.iter().map(pull).sum::<f64>().powi(2)).sum();
                 let drawn: f64 = (0..all).map(|k| prior(k) * column[k] * column[k]).sum();
-                *sigma = (told + drawn).sqrt();
+                *sigma = (pulled + drawn).sqrt();
             }
         }
         values = factor.solve(right);

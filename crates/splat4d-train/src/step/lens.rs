@@ -136,8 +136,8 @@ mod tests {
         let mut table = Table::<f64>::new(&[("row", 10)], points.len());
         points.iter().enumerate().for_each(|(j, p)| table.write(j, 0, *p));
         let colors = Table::<f64>::new(&[("color", 3)], points.len());
-        let mut splats = Splats { parts: vec![Part::new(&table, Color::Direct { table: &colors })], head: None };
         let mut bent = Bent::default();
+        let mut splats = Splats { parts: vec![Part::new(&table, Color::Direct { table: &colors })], head: None };
         bent.bend(&mut splats, &Bend::of(&camera).unwrap());
         let after = Distortion::after(Lens::Pinhole, k);
         let i = plain.intrinsics;
