@@ -188,7 +188,7 @@ pub(super) fn vignetting(
             (some, _) => format!("{some} cameras ({}{})", names.join(", "), if some > NAMED { ", …" } else { "" }),
         };
         let what = format!(
-            "{who}: the corners of images lose {:.0} ± {:.0} % of their light ({} features that two images show).",
+            "{who}: the corners of images lose {:.1} ± {:.1} % of their light ({} features that two images show).",
             100.0 * loss,
             100.0 * sigma,
             falloff.features
