@@ -174,6 +174,10 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     }
     let mut known = given::known(given.as_ref(), &corrections, folder, &mut pictures)?;
     let mut clicked = None;
+    if request.keypoints.is_some() {
+        // Before a network runs for minutes.
+        given::without_poses(&known, "keypoints of people", "--keypoints")?;
+    }
     let people = match &request.keypoints {
         Some(Keypoints::Given(folder)) => Some(people::given(folder, &cameras, &pictures)?),
         Some(Keypoints::By(detector)) => {

@@ -136,7 +136,7 @@ pub(super) fn detected(
 
 /// Finds the rig by keypoints of people, and puts lenses and poses among the known ones.
 ///
-/// Errors: calibrated positions; people who give no rig, or one that may be wrong.
+/// Errors: people who give no rig, or one that may be wrong.
 pub(super) fn placed(
     people: People,
     pictures: &[Pictures],
@@ -145,7 +145,6 @@ pub(super) fn placed(
     kept: &[bool],
     report: &mut Report,
 ) -> Result<Placed> {
-    given::without_poses(known, "keypoints of people", "--keypoints")?;
     let names: Vec<&str> = pictures.iter().map(|p| p.name.as_str()).collect();
     let People { mut frames, intervals, place } = people;
     let mut rig = Vec::with_capacity(names.len());

@@ -127,7 +127,7 @@ fn page(report: &Report, capture: &Capture) -> String {
         );
         row(
             "light lost in corners",
-            camera.vignetting.map(|[v, s]| format!("{:.0} ± {:.0} %", 100.0 * v, 100.0 * s)),
+            camera.vignetting.map(|[v, s]| format!("{:.1} ± {:.1} %", 100.0 * v, 100.0 * s)),
             String::new(),
         );
         body.push_str("</table></div>\n");
